@@ -15,7 +15,7 @@ from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.cloud_file import write_cloud
 from cflow_torch.data.arrays.folder import find_array_logs
 from cflow_torch.data.arrays.reader import ArraysLog
-from cflow_torch.data.arrays.stamps import times_of_names
+from cflow_torch.data.arrays.stamps import nanoseconds_of_dates, nanoseconds_of_numbers, times_of_names
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
@@ -168,6 +168,23 @@ def test_names_are_milliseconds() -> None:
 @pytest.mark.parametrize("first", ["000001", "frame1", "000_001", "2024_01_05", "0000000000001", "0000000000000000001"])
 def test_other_names_are_no_times(first: str) -> None:
     assert times_of_names([first, first[:-1] + "2"]) is None and times_of_names(["1.5", "a"]) is None
+
+
+@pytest.mark.parametrize("start", ["2023-05-12-10-00-00_", "20230512_", "os1.", "2023-05-12 10:00:00."])
+def test_numbers_that_count_the_files_are_no_times(start: str) -> None:
+    for step in (1, 5):
+        assert times_of_names([f"{start}{k:06d}" for k in range(0, 60, step)]) is None
+    names = [f"1700000000.{k:03d}_{number:06d}" for number, k in enumerate(range(0, 900, 50))]
+    assert times_of_names(names) == [1_700_000_000_000_000_000 + 50_000_000 * k for k in range(18)]
+
+
+def test_dates_may_have_a_time_zone() -> None:
+    noon, utc = "2023-11-14T22:13:20", 1_700_000_000_000_000_000
+    zones = {"": 0, "Z": 0, "+08:00": -8, "-0330": 3.5, ".25+01:00": -1, "_25": 0}
+    for end, hours in zones.items():
+        expected = utc + int(hours * 3600) * 10**9 + (250_000_000 if "25" in end else 0)
+        assert nanoseconds_of_dates([noon + end]) == [expected], end
+    assert nanoseconds_of_dates(["2023-11-14-22-13-20-0250"]) == [utc + 25_000_000]
 
 
 def test_a_missing_sweep_shortens_windows_and_fails_its_pairs(tmp_path) -> None:
@@ -469,6 +486,21 @@ def test_times_from_another_start_have_the_unit_of_their_steps(tmp_path) -> None
     for unit, step in ((1, 0.1), (10**3, 100), (10**6, 100_000), (10**9, 100_000_000)):
         np.savetxt(tmp_path / "times.txt", 0.1 * unit * np.arange(12), "%.7g" if unit == 1 else "%d")
         assert ArraysLog(tmp_path).timestamps == [k * 100_000_000 for k in range(12)], step
+
+
+@pytest.mark.parametrize(
+    ("first", "step", "unit"),
+    [
+        (150 * 10**9, 10**8, 1),  # since boot
+        (1_700_000_000, 10**8, 1),  # since boot, of the size of unix seconds
+        (3 * 86_400 * 10**6, 10**5, 10**3),
+        (300_000 * 10**6, 10**5, 10**3),  # of the GPS week
+        (1_700_000_000, 1, 10**9),
+    ],
+)
+def test_times_of_any_size_have_the_unit_of_their_steps(first: int, step: int, unit: int) -> None:
+    times = [first + k * step for k in range(12)]
+    assert nanoseconds_of_numbers([str(time) for time in reversed(times)]) == [time * unit for time in reversed(times)]
 
 
 def test_rare_poses_are_joined_by_arcs_and_not_called_late() -> None:
