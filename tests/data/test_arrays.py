@@ -91,6 +91,9 @@ TEXTS = {
     ".txt": lambda table: lines(table),
     "_3.txt": lambda table: "  " + lines(table[:, :3], "   ", "  \r\n  ").rstrip(),
     "_6.txt": lambda table: "# from a scanner\n" + lines(np.column_stack([table, table[:, :2]])),
+    "_c.txt": lambda table: f"//X Y Z t\n{len(table)}\n" + lines(table),
+    "_e.csv": lambda table: "x,y,z,t,\n" + lines(table, ",", ",\n"),
+    "_f.csv": lambda table: "t,z,y,x\n" + lines(table[:, ::-1], ",", ",\n"),
     ".pts": lambda table: f"{len(table)}\n" + lines(table),
     ".asc": lambda table: "# X Y Z t\n" + lines(table),
     ".xyz": lambda table: "//x\ty\tz\tt\n" + lines(table, "\t"),
@@ -108,7 +111,7 @@ def test_clouds_are_read_from_texts(tmp_path, suffix):
     assert len(log) == 3 and len(log.poses) == 3
     has_empty_row = suffix == "_t.csv"
     assert np.array_equal(log.sweep(1).points[has_empty_row:], tables[1, :, :3].astype(np.float32))
-    if suffix in (".csv", ".CSV", "_.csv", ".asc", ".xyz"):
+    if suffix in (".csv", ".CSV", "_.csv", "_c.txt", "_e.csv", "_f.csv", ".asc", ".xyz"):
         assert np.array_equal(log.columns(1)["t"], tables[1, :, 3])
 
 

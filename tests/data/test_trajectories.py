@@ -252,7 +252,6 @@ def test_layouts_of_poses(tmp_path, layout) -> None:
         "radians",
         "time, by columns",
         "time and angles",
-        "vertices of g2o",
     )
     assert (read.times_ns is not None) == has_times and (not has_times or read.times_ns[2] == 2 * 10**9)
 
@@ -287,6 +286,59 @@ def test_places_on_the_globe_become_metres(tmp_path) -> None:
     expected = [[-0.5566 * k, 1.1132 * k, 100 + k] for k in range(3)]
     assert np.allclose(read.poses[:, :3, 3], expected, atol=1e-3)
     assert np.allclose(read.poses[:, :3, :3], rotations_about(2, 0.5))
+
+
+W_FIRST = [line(k, seconds(stamp), "t x y z qw qx qy qz", ",") for k, stamp in enumerate(STAMPS)]
+QUOTED = [",".join(f'"{word}"' for word in text.split()) for text in EXACT]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["timestamp,frame,x,y,z,qw,qx,qy,qz", *(text.replace(",", ",,", 1) for text in W_FIRST)],
+        [
+            "t,note,x,y,z,qx,qy,qz,qw",
+            *(text.replace(" ", f",{k // 5 or ''},", 1).replace(" ", ",") for k, text in enumerate(EXACT)),
+        ],
+        ["t,x,y,z,qx,qy,qz,qw", *QUOTED],
+        ["t,x,y,z,qx,qy,qz,qw", *(text.replace(" ", ", ") + "," for text in EXACT)],
+        ["t,x,y,z,qx,qy,qz,qw,covariance", *(text.replace(" ", ",") + ",nan" for text in EXACT)],
+    ],
+)
+def test_columns_may_be_empty_quoted_or_nan(tmp_path, lines) -> None:
+    (tmp_path / "poses.csv").write_text("\n".join(lines))
+    read = poses_text.read_poses(tmp_path / "poses.csv")
+    assert read.times_ns is not None and read.times_ns.tolist() == STAMPS
+    assert np.allclose(read.poses[:, 0, 3], range(COUNT)) and np.allclose(read.poses[3, 1, 0], 0.96)
+
+
+def test_labels_of_rows_stay_with_their_poses(tmp_path) -> None:
+    lines = [f"{name},{line(k, str(k), separator=',')}" for k, name in ((2, "c"), (0, "a"), (1, "b"))]
+    (tmp_path / "poses.csv").write_text("\n".join(["name,t,x,y,z,qx,qy,qz,qw", *lines]))
+    read = poses_text.read_poses(tmp_path / "poses.csv")
+    assert read.labels == ["a", "b", "c"] and read.poses[:, 0, 3].tolist() == [0, 1, 2]
+
+
+def test_keys_of_a_graph_are_no_times(tmp_path) -> None:
+    """GTSAM writes keys that are a letter in the upper bits of 64."""
+    folder = clouds(tmp_path, [f"{k:06d}" for k in range(COUNT)])
+    for first in (0, 8646911284551352320):
+        lines = [f"VERTEX_SE3:QUAT {first + k} {line(k, '').strip()}" for k in range(COUNT)]
+        (folder / "graph.g2o").write_text("\n".join(lines))
+        log = ArraysLog(folder, "graph.g2o")
+        assert log.poses[:, 0, 3].tolist() == list(range(COUNT)) and not log._has_times
+
+
+def test_a_table_may_have_a_column_of_times(tmp_path) -> None:
+    clouds(tmp_path, range(COUNT))
+    (tmp_path / "times.txt").write_text("\n".join(["frame,time", *(f"{k},{seconds(t)}" for k, t in enumerate(STAMPS))]))
+    assert ArraysLog(tmp_path).timestamps == STAMPS
+    (tmp_path / "times.txt").write_text("1 2\n2 3\n")
+    with pytest.raises(CFlowError, match="one time per line, or a column called time"):
+        poses_text.read_times(tmp_path / "times.txt")
+    (tmp_path / "times.txt").write_text("1 2\n2 3\n", "utf-16")
+    with pytest.raises(CFlowError, match="in UTF-8"):
+        poses_text.read_times(tmp_path / "times.txt")
 
 
 def test_lines_with_times_may_have_any_order(tmp_path) -> None:

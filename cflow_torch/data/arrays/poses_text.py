@@ -8,9 +8,8 @@ from typing import Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.data.arrays.stamps import nanoseconds_of_dates, nanoseconds_of_numbers
+from cflow_torch.data.arrays.stamps import nanoseconds_of_numbers
 from cflow_torch.data.arrays.tables import (
-    COMMENTS,
     MATRIX,
     Table,
     as_decimals,
@@ -80,6 +79,11 @@ def files_of_poses(folder: Path) -> list[Path]:
 
 def parse_poses(content: bytes, path: Path) -> Trajectory:
     """Return the poses in the content of a file of text or `STRUCTURED`."""
+    with file_errors(path):
+        return _poses_in(content, path)
+
+
+def _poses_in(content: bytes, path: Path) -> Trajectory:
     if path.suffix == ".npy":
         numbers = parse_npy(content, path, "pass a .npy file of (K, 4, 4) numbers")
         if numbers.shape in ((3, 4), (4, 4)):  # of a folder with a file per pose
@@ -137,15 +141,16 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
         )
     numbers = words.astype(np.float64)
     rotation = [column for role, column in roles.items() if role in _ROTATIONS]
-    is_known = np.isfinite(numbers).all(axis=1)
+    is_known = np.isfinite(numbers[:, list(roles.values())]).all(axis=1)
     is_known &= not rotation or (numbers[:, rotation] != 0).any(axis=1)  # programs write zeros for lost poses
     if not is_known.any():
-        raise CFlowError(f"{path} has no line of finite numbers")
+        raise CFlowError(f"{path} has no pose of finite numbers and a rotation that is not 0")
     if not _TIMES.isdisjoint(roles):  # programs write a line twice; without times, lines repeat if the vehicle stands
-        words = words[is_known]
-        words = words[np.argsort(_nanoseconds(roles, words), kind="stable")]
-        words = words[np.concatenate([[True], (words[1:] != words[:-1]).any(axis=1)])]
-        is_known = np.ones(len(words), bool)
+        rows = np.flatnonzero(is_known)
+        rows = rows[np.argsort(_nanoseconds(roles, words[rows]), kind="stable")]
+        rows = rows[np.concatenate([[True], (words[rows[1:]] != words[rows[:-1]]).any(axis=1)])]
+        words, is_known = words[rows], is_known[rows]
+        labels = [labels[row] for row in rows] if labels else []
     poses = np.full((len(words), 4, 4), np.nan)
     poses[is_known] = _poses_of_columns(names, roles, words[is_known], path)
     is_kitti = MATRIX[0] in roles and not names and words.shape[1] in (12, 13)
@@ -231,7 +236,7 @@ def _nanoseconds(roles: Mapping[str, int], words: np.ndarray) -> np.ndarray:
     """Return the times of poses, (K,) int64 nanoseconds."""
     if {"sec", "nsec"} <= set(roles):
         pairs = words[:, [roles["sec"], roles["nsec"]]].tolist()
-        return np.array([int(second) * 10**9 + int(rest) for second, rest in pairs], np.int64)
+        return np.array([int(Decimal(second) * 10**9 + Decimal(rest)) for second, rest in pairs], np.int64)
     return np.array(nanoseconds_of_numbers(words[:, roles["time"]].tolist()), np.int64)
 
 
@@ -247,16 +252,14 @@ def read_times(path: PathLike) -> np.ndarray:
 
 
 def parse_times(content: bytes, path: Path) -> np.ndarray:
-    with file_errors(path):
-        lines = [line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()]
-        lines = [line for line in lines if not line.startswith(COMMENTS)]
-    dates = nanoseconds_of_dates(lines)
-    if dates:
-        return _ascending(path, np.array(dates, np.int64))
-    words = parse_table(content, path).words
-    if words.shape[1] != 1:
-        raise CFlowError(f"{path} must have one time in seconds per line")
-    return _ascending(path, np.array(nanoseconds_of_numbers(words[:, 0].tolist()), np.int64))
+    with file_errors(path, _NAMES):
+        names, words, _ = parse_table(content, path)
+        columns = (
+            {role_of_name(name): column for column, name in enumerate(names)} if words.shape[1] > 1 else {"time": 0}
+        )
+        if "time" not in columns:
+            raise CFlowError(f"{path} must have one time per line, or a column called time")
+        return _ascending(path, np.array(nanoseconds_of_numbers(words[:, columns["time"]].tolist()), np.int64))
 
 
 def _ascending(path: Path, times: np.ndarray, fix: str = _NAMES) -> np.ndarray:
