@@ -59,15 +59,25 @@ Sample = Tuple[float, ...]  # nanoseconds (int), x, y, z, and the quaternion w, 
 
 
 class Frames:
-    """A tree of coordinate frames: the parent of each frame, and samples of its `T_parent_frame` over time."""
+    """A tree of coordinate frames: the parent of each frame, and samples of its `T_parent_frame` over time.
 
-    def __init__(self, parents: dict[str, str], samples: dict[str, list[Sample]]) -> None:
-        self._parents = parents
-        # If all samples of a transform are equal, it is fixed, and we keep one of them.
-        self._links = {
-            child: sorted_poses(rows if len({row[1:] for row in rows}) > 1 else rows[:1], f"the transform to {child}")
-            for child, rows in samples.items()
-        }
+    `samples` are those of each parent and frame. Of several parents of a frame, we take the one with the most samples; ties: the last.
+    """
+
+    def __init__(self, samples: dict[tuple[str, str], list[Sample]]) -> None:
+        by_count = sorted(samples, key=lambda link: len(samples[link]))
+        self._parents = {child: parent for parent, child in by_count}
+        self.ignored = [f"{parent} to {child}" for parent, child in by_count if self._parents[child] != parent]
+        self._samples = {child: samples[parent, child] for child, parent in self._parents.items()}
+        self._links: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+
+    def _link(self, child: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the times and poses of the transform to a frame; one of each if all its samples are equal."""
+        if child not in self._links:
+            rows = self._samples[child]
+            is_fixed = len({row[1:] for row in rows}) == 1
+            self._links[child] = sorted_poses(rows[:1] if is_fixed else rows, f"the transform to {child}")
+        return self._links[child]
 
     def chain(self, frame: str) -> list[str]:
         """Return the frame, its parent, ... up to the root."""
@@ -81,7 +91,7 @@ class Frames:
 
     def change_times(self, frame: str) -> np.ndarray:
         """Return the sample times of all moving transforms between the root and a frame, (K,) int64 ns, ascending."""
-        times = [self._links[child][0] for child in self.chain(frame)[:-1]]
+        times = [self._link(child)[0] for child in self.chain(frame)[:-1]]
         return np.unique(np.concatenate([np.zeros(0, np.int64), *(t for t in times if len(t) > 1)]))
 
     def in_root(self, frame: str, times_ns: np.ndarray) -> np.ndarray:
@@ -91,14 +101,14 @@ class Frames:
         """
         result = np.tile(np.eye(4), (len(times_ns), 1, 1))
         for child in self.chain(frame)[:-1]:
-            times, poses = self._links[child]
+            times, poses = self._link(child)
             at = poses_at(np.clip(times_ns, times[0], times[-1]), times, poses) if len(times) > 1 else poses
             result = at @ result
         return result
 
     def is_moving(self, child: str) -> bool:
         """Test whether the transform from the parent of a frame to the frame changes."""
-        return child in self._links and len(self._links[child][0]) > 1
+        return child in self._samples and len(self._link(child)[0]) > 1
 
     def world_of(self, frame: str) -> str:
         """Return the frame in which the path of a frame is continuous: its root, or the one below corrections.
@@ -107,7 +117,7 @@ class Frames:
         """
         moving = [child for child in self.chain(frame)[:-1] if self.is_moving(child)]
         for child in moving[1:]:
-            poses = self._links[child][1]
+            poses = self._link(child)[1]
             is_constant = np.abs(np.diff(poses, axis=0)).max(axis=(1, 2)) < _CONSTANT
             if child.split("/")[-1] == "odom" or is_constant.mean() > 0.5:
                 return child
