@@ -23,6 +23,7 @@ _ROLES = {
     "pitch": ".*pitch(deg|degrees|rad|radians)?",
     "yaw": ".*(yaw|heading|theta)(deg|degrees|rad|radians)?",
 }
+_TIME_OF_POINT = "((d|delta)?t|.*time|.*stamp|(t|.*time|.*stamp)?offset)(s|secs?|nsecs?|ns|us|ms|unix)?"
 _OTHERS = "twist|linear|angular|veloc|accel|covariance|rate"
 
 
@@ -45,7 +46,7 @@ def role_of_name(name: str) -> str | None:
 
 def time_columns(names: Iterable[str]) -> list[str]:
     """Return those of the names that columns with times of points have."""
-    return [name for name in names if role_of_name(name) == "time" or _plain(name) in ("dt", "offset", "timeoffset")]
+    return [name for name in names if re.fullmatch(_TIME_OF_POINT, _plain(name))]
 
 
 def _plain(name: str) -> str:
