@@ -273,6 +273,9 @@ def test_clouds_of_two_sensors_in_one_folder_need_a_choice(tmp_path):
     with pytest.raises(CFlowError, match=r"front_\*\.npy, rear_\*\.npy: choose one by suffix"):
         ArraysLog(tmp_path)
     assert [sweep.points[0, 0] for sweep in ArraysLog(tmp_path, suffix="rear_*.npy")] == [3, 4]
+    np.save(tmp_path / "front_2.npy", np.full((3, 3), 9.0))
+    with pytest.raises(CFlowError, match=r"front_\*\.npy, rear_\*\.npy: choose one by suffix"):
+        ArraysLog(tmp_path)
 
 
 def test_files_with_other_contents_are_refused(tmp_path):

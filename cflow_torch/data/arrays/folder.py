@@ -91,7 +91,8 @@ def _kinds(folder: Path) -> dict[str, list[Path]]:
 def _alike(files: Sequence[Path]) -> dict[str, list[Path]]:
     """Return the files of each suffix that has two or more, or of each pattern of names.
 
-    They have several patterns if their names differ only by what is not a number: front_001.pcd, rear_001.pcd.
+    They have several patterns if mostly the same numbers are in names that differ otherwise: front_001.pcd,
+    rear_001.pcd.
     """
     suffixes: dict[str, list[Path]] = {}
     for path in files:
@@ -101,10 +102,10 @@ def _alike(files: Sequence[Path]) -> dict[str, list[Path]]:
         patterns: dict[str, list[Path]] = {}
         for path in same:
             patterns.setdefault(_pattern(path), []).append(path)
-        numbers = {
-            tuple(sorted("-".join(re.findall(r"\d+", stem_of(path))) for path in each)) for each in patterns.values()
-        }
-        kinds.update(patterns if len(numbers) == 1 < len(patterns) < len(same) else {suffix: same})
+        numbers = [{"-".join(re.findall(r"\d+", stem_of(path))) for path in each} for each in patterns.values()]
+        fewest = min(map(len, numbers))
+        are_sensors = fewest > 1 < len(patterns) and 2 * len(set.intersection(*numbers)) > fewest
+        kinds.update(patterns if are_sensors else {suffix: same})
     return {kind: same for kind, same in kinds.items() if len(same) > 1}
 
 
