@@ -209,9 +209,12 @@ class ArraysLog(Log):
             with file_errors(file):
                 viewpoint = pcd_viewpoint(read_start(file, LONGEST_HEADER))
             row[:] = row if viewpoint is None else viewpoint
-        if (numbers == np.eye(7)[3]).all():
+        known = np.flatnonzero(np.isfinite(numbers).all(axis=1) & numbers[:, 3:].any(axis=1))
+        if (numbers[known] == np.eye(7)[3]).all():
             return None
-        poses = poses_from_quaternions(numbers[:, :3], numbers[:, 3:], lambda k: f"{self.files[k]}: VIEWPOINT")
+        what = f"VIEWPOINT of {self.folder}, of its poses number"
+        poses = np.full((len(numbers), 4, 4), np.nan)
+        poses[known] = poses_from_quaternions(numbers[known, :3], numbers[known, 3:], lambda k: f"{what} {k}")
         return Trajectory(poses, None, False, _VIEWPOINT)
 
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
@@ -326,7 +329,7 @@ def _number_of(stem: str) -> int:
 def _drives_along_x(poses: np.ndarray) -> bool:
     """Test whether poses (K, 4, 4) move along their own x axis more than along y and z."""
     steps = np.linalg.inv(poses[:-1]) @ poses[1:]
-    along = np.abs(steps[:, :3, 3]).sum(axis=0)
+    along = np.nansum(np.abs(steps[:, :3, 3]), axis=0)  # unknown poses are NaN
     return bool(along[0] > along[1] + along[2])
 
 
