@@ -472,6 +472,33 @@ def test_poses_may_be_arrays_of_the_clouds(tmp_path) -> None:
         assert np.diff(log.timestamps).tolist() == [10**8 if "stamp" in name else 1] * (len(POSES) - 1)
 
 
+def test_rotations_with_few_decimals_become_the_nearest_ones(tmp_path) -> None:
+    tum = [f"{k} {k} 0 0 0 0 0.71 0.71" for k in range(12)]
+    (tmp_path / "poses.txt").write_text("\n".join(tum))
+    assert np.allclose(poses_text.read_poses(tmp_path / "poses.txt").poses[:, :2, 0], (0, 1), atol=1e-12)
+    for decimals in (2, 3):
+        np.savetxt(tmp_path / "poses.txt", POSES[:, :3].reshape(12, 12), f"%.{decimals}f")
+        read = poses_text.read_poses(tmp_path / "poses.txt").poses
+        assert np.allclose(read, POSES, atol=2 * 10**-decimals)
+    mirrored = POSES[:, :3] * (1, 1, -1, 1)
+    np.savetxt(tmp_path / "poses.txt", mirrored.reshape(12, 12), "%.3f")
+    with pytest.raises(CFlowError, match="not rigid.*right-handed"):
+        poses_text.read_poses(tmp_path / "poses.txt")
+
+
+def test_unknown_poses_do_not_hide_where_the_vehicle_drives(tmp_path) -> None:
+    """Poses of the LiDAR next to KITTI's calibration of the camera, one of zeros."""
+    clouds(tmp_path, [f"{k:06d}" for k in range(COUNT)])
+    poses = np.tile(np.eye(4)[:3], (COUNT, 1, 1))
+    poses[:, 0, 3] = range(COUNT)
+    poses[4] = 0
+    np.savetxt(tmp_path / "poses.txt", poses.reshape(COUNT, 12))
+    (tmp_path / "calib.txt").write_text("Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
+    with pytest.warns(CFlowWarning, match="drive along x"):
+        log = ArraysLog(tmp_path)
+    assert log.poses[:, 0, 3].tolist() == [k for k in range(COUNT) if k != 4]
+
+
 def test_numbers_of_files_tell_missing_sweeps(tmp_path) -> None:
     """Without times, a gap is found by the numbers, unless they are irregular."""
     for name, numbers, gaps in (

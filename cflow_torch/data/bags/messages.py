@@ -61,7 +61,8 @@ Sample = Tuple[float, ...]  # nanoseconds (int), x, y, z, and the quaternion w, 
 class Frames:
     """A tree of coordinate frames: the parent of each frame, and samples of its `T_parent_frame` over time.
 
-    `samples` are those of each parent and frame. Of several parents of a frame, we take the one with the most samples; ties: the last.
+    `samples` are those of each parent and frame. Of several parents of a frame, we take the one with the most samples.
+    Ties: the last.
     """
 
     def __init__(self, samples: dict[tuple[str, str], list[Sample]]) -> None:
