@@ -18,7 +18,7 @@ from cflow_torch.data.folders import distinct_names, find_folders, visible
 from cflow_torch.data.log import CachedLog, Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
-from cflow_torch.data.paths import as_path, exist, is_path_like, remote_errors, safe_name
+from cflow_torch.data.paths import as_path, exist, is_path_like, remote_errors, safe_name, suffix_of
 from cflow_torch.data.read_as import read_as as read_log_as
 from cflow_torch.ground.segmentation import GROUND_METHODS, has_ground
 from cflow_torch.ground.segmentation import find_ground as ground_of
@@ -172,10 +172,10 @@ def _why_nothing_fits(top: Path) -> str:
 
     level, suffixes = [top], Counter()  # type: ignore[var-annotated]
     for _ in range(_DEEPEST):
-        suffixes.update(path.suffix.lower() for path in level if path.is_file())
+        suffixes.update(suffix_of(path) or path.suffix for path in level if path.is_file())
         level = [path for folder in level for path in visible(folder)]
     if not suffixes:
-        return "it has no files" if top.is_dir() else ""
+        return "it has no files that you may read" if top.is_dir() else ""
     suffix, count = suffixes.most_common(1)[0]
     clouds = [kind for kind in suffixes if kind in SUFFIXES] or [kind for kind in suffixes if kind in TEXTS]
     if clouds and all(suffixes[kind] == 1 for kind in clouds):

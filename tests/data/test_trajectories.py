@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -446,6 +448,56 @@ def test_poses_near_a_folder_are_those_at_its_times(tmp_path) -> None:
     (tmp_path / "global.txt").write_text("\n".join(EXACT))
     with pytest.warns(CFlowWarning, match="global.txt and .*poses.csv: choose one with data.poses"):
         assert ArraysLog(folder).poses is None
+
+
+def test_files_that_nobody_named_stop_no_log(tmp_path, monkeypatch) -> None:
+    """A folder of another user, a table whose times repeat after its start, and times that end with text."""
+    folder = clouds(tmp_path / "drive")
+    (tmp_path / "other").mkdir()
+    list_all = Path.iterdir
+    monkeypatch.setattr(Path, "iterdir", lambda path: locked(path) if path.name == "other" else list_all(path))
+    (tmp_path / "cam").mkdir()
+    imu = [line(k, seconds(START + k * 10**6)) for k in range(500)]
+    (tmp_path / "cam" / "imu.csv").write_text("\n".join([*imu, line(9, seconds(START))]))
+    with pytest.warns(CFlowWarning, match=r"we do not use imu\.csv: .*times must ascend"):
+        assert ArraysLog(folder).poses is None
+    numbered = clouds(tmp_path / "numbered" / "drive", range(COUNT))
+    lines = [str(k / 10) for k in range(3000)]
+    (numbered / "camera_timestamps.txt").write_text("\n".join([*lines, "end"]))
+    with pytest.warns(CFlowWarning, match=r"we do not use camera_timestamps\.txt"):
+        assert not ArraysLog(numbered)._has_times
+
+
+def locked(path: Any) -> Any:
+    raise PermissionError(f"{path}: permission denied")
+
+
+@pytest.mark.parametrize("bad", ["nan", "1e400", "9" * 40])
+def test_times_that_are_no_times_are_an_error_of_ours(tmp_path, bad) -> None:
+    (tmp_path / "times.txt").write_text(f"{bad}\n1.0\n")
+    with pytest.raises(CFlowError, match=r"times\.txt"):
+        poses_text.read_times(tmp_path / "times.txt")
+
+
+def test_seconds_and_nanoseconds_may_be_floats(tmp_path) -> None:
+    rows_of = [line(k, f"{s // 10**9}.0,{s % 10**9:.1f}", separator=",") for k, s in enumerate(STAMPS)]
+    (tmp_path / "a.csv").write_text("\n".join(["secs,nsecs,x,y,z,qx,qy,qz,qw", *rows_of]))
+    assert poses_text.read_poses(tmp_path / "a.csv").times_ns.tolist() == STAMPS
+
+
+@pytest.mark.parametrize("name", ["poses.npy.gz", "poses.NPY", "poses.txt.gz", "poses.json.gz"])
+def test_poses_may_be_compressed_and_suffixes_large(tmp_path, name) -> None:
+    folder = clouds(tmp_path, [f"{k:06d}" for k in range(COUNT)])
+    content = io.BytesIO()
+    np.save(content, POSES)
+    texts = {"npy": content.getvalue(), "txt": "\n".join(rows(POSES[:, :3].reshape(12, 12))).encode()}
+    texts["json"] = json.dumps(POSES.tolist()).encode()
+    raw = texts[name.split(".")[1].lower()]
+    (folder / name).write_bytes(gzip.compress(raw) if name.endswith("gz") else raw)
+    with pytest.warns(CFlowWarning, match=f"its poses are those of {name}"):
+        assert np.allclose(ArraysLog(folder).poses, POSES, atol=1e-6)
+    (folder / name).write_bytes(gzip.compress(raw)[:60] + b"broken" * 9)
+    assert ArraysLog(folder).poses is None
 
 
 def test_poses_may_be_arrays_of_the_clouds(tmp_path) -> None:

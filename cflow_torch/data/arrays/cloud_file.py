@@ -18,7 +18,8 @@ from cflow_torch.data.arrays.pcd import pcd_fields, pcd_viewpoint, pypcd4
 from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import file_errors, shortened
-from cflow_torch.data.paths import GZ, PathLike, as_path, read_bytes
+from cflow_torch.data.paths import PathLike, as_path, read_bytes, suffix_of
+from cflow_torch.data.paths import stem_of as stem_of
 from cflow_torch.tensors import resolution
 from cflow_torch.types import CFlowError, check_array
 
@@ -213,16 +214,6 @@ def _write_pcd(file: Any, fields: Mapping[str, np.ndarray], viewpoint: Any) -> N
     if viewpoint is not None:
         cloud.metadata.viewpoint = tuple(map(float, viewpoint))
     cloud.save(file, pcd.Encoding.BINARY)
-
-
-def suffix_of(path: Path) -> str:
-    """Return the suffix of a cloud's format, without `.gz`, in lower case."""
-    return (path.with_suffix("") if path.suffix.lower() == GZ else path).suffix.lower()
-
-
-def stem_of(path: Path) -> str:
-    """Return the name of a cloud without its suffixes."""
-    return (path.with_suffix("") if path.suffix.lower() == GZ else path).stem
 
 
 def _suffix(path: Path) -> str:

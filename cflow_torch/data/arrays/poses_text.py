@@ -19,9 +19,9 @@ from cflow_torch.data.arrays.tables import (
 )
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.folders import natural_key
+from cflow_torch.data.folders import natural_key, visible
 from cflow_torch.data.npy_file import parse_npy
-from cflow_torch.data.paths import PathLike, as_path, read_bytes
+from cflow_torch.data.paths import PathLike, as_path, read_bytes, suffix_of
 from cflow_torch.data.trajectory import Trajectory, checked_poses, positions_of_degrees
 from cflow_torch.transforms import as_matrix, poses_from_quaternions, rotations_of
 from cflow_torch.types import CFlowError
@@ -73,7 +73,7 @@ def read_poses(path: PathLike) -> Trajectory:
 
 def files_of_poses(folder: Path) -> list[Path]:
     """Return the files of a folder that may have a pose each, in order."""
-    files = [path for path in folder.iterdir() if path.suffix.lower() in (".txt", ".json", ".npy")]
+    files = [path for path in visible(folder) if suffix_of(path) in (".txt", ".json", ".npy")]
     return sorted(files, key=lambda path: natural_key(path.stem))
 
 
@@ -84,14 +84,14 @@ def parse_poses(content: bytes, path: Path) -> Trajectory:
 
 
 def _poses_in(content: bytes, path: Path) -> Trajectory:
-    if path.suffix == ".npy":
+    if suffix_of(path) == ".npy":
         numbers = parse_npy(content, path, "pass a .npy file of (K, 4, 4) numbers")
         if numbers.shape in ((3, 4), (4, 4)):  # of a folder with a file per pose
             numbers = numbers[None]
         if numbers.ndim == 2 and numbers.shape[1] in _UNNAMED and numbers.dtype.kind in "fiu":
             return _poses_of_table(Table([], numbers.astype(str), []), path)
         return Trajectory(checked_poses(numbers, str(path)), None, False, str(path))
-    if path.suffix.lower() not in STRUCTURED:
+    if suffix_of(path) not in STRUCTURED:
         return _poses_of_table(parse_table(content, path), path)
     error = CFlowError(f"{path} has no list of poses: matrices of 16 or 12 numbers, or positions and rotations")
     for table in tables_of_values(content, path):

@@ -17,7 +17,7 @@ from cflow_torch.data.arrays.stamps import nanoseconds_of_dates
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
-from cflow_torch.data.paths import read_bytes
+from cflow_torch.data.paths import read_bytes, suffix_of
 
 _FEWEST_NUMBERS = 7  # of a pose
 COMMENTS = ("#", "%", "//")
@@ -142,7 +142,7 @@ def table_of(members: Sequence[Any], labels: Sequence[str] = ()) -> Table | None
 
 def _value_of(content: bytes, path: Path) -> Any:
     """Return the lists, dictionaries and Decimals in a file. Nothing is unpickled."""
-    kind = path.suffix.lower()
+    kind = suffix_of(path)
     with file_errors(f"{path} as {kind[1:]}"):
         if kind == ".npz":
             with np.load(io.BytesIO(content), allow_pickle=False) as archive:

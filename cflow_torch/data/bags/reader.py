@@ -155,8 +155,7 @@ class BagLog(Log):
         """Return the poses of the file that is named, of the bag or, with "auto", of a file near the bag."""
         trajectory = self._poses_of_file(poses) or self._poses_of_bag(topics, poses, tracks)
         if trajectory is None and poses == "auto":
-            trajectory, note = find_poses_near(self.path.parent, self.timestamps)
-            self._note(note)
+            trajectory = find_poses_near(self.path.parent, self.timestamps, self._note)
         return trajectory
 
     def _poses_of_bag(self, topics: dict[str, str], poses: str | None, tracks: dict[str, Any]) -> Trajectory | None:
