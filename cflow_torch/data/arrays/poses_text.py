@@ -240,18 +240,19 @@ def _nanoseconds(roles: Mapping[str, int], words: np.ndarray) -> np.ndarray:
     return np.array(nanoseconds_of_numbers(words[:, roles["time"]].tolist()), np.int64)
 
 
-def read_times(path: PathLike) -> np.ndarray:
+def read_times(path: PathLike, is_sorted: bool = True) -> np.ndarray:
     """Read a file with one ascending time per line (KITTI's `times.txt`) as (K,) int64 nanoseconds.
 
-    Times are seconds, unix times in s, ms, us or ns, or dates (2011-09-26 13:02:25.594360375).
+    Times are seconds, unix times in s, ms, us or ns, or dates (2011-09-26 13:02:25.594360375). If they need not be
+    sorted, pass False.
     """
     path = as_path(path)
     with file_errors(path):
         content = read_bytes(path)
-    return parse_times(content, path)
+    return parse_times(content, path, is_sorted)
 
 
-def parse_times(content: bytes, path: Path) -> np.ndarray:
+def parse_times(content: bytes, path: Path, is_sorted: bool = True) -> np.ndarray:
     with file_errors(path, _NAMES):
         names, words, _ = parse_table(content, path)
         columns = (
@@ -259,7 +260,8 @@ def parse_times(content: bytes, path: Path) -> np.ndarray:
         )
         if "time" not in columns:
             raise CFlowError(f"{path} must have one time per line, or a column called time")
-        return _ascending(path, np.array(nanoseconds_of_numbers(words[:, columns["time"]].tolist()), np.int64))
+        times: np.ndarray = np.array(nanoseconds_of_numbers(words[:, columns["time"]].tolist()), np.int64)
+        return _ascending(path, times) if is_sorted else times
 
 
 def _ascending(path: Path, times: np.ndarray, fix: str = _NAMES) -> np.ndarray:
