@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from typing import Iterable, Sequence
 
+AXES = ("x", "y", "z")
 # Names without punctuation and units, as drivers, odometry programs and exports of ROS messages write them.
 _ROTATION = "(q|.*quat|.*quaternion|.*orientation|.*rot|.*rotation|.*heading|qrs)"
 _POSITION = "(t|p|pos|prsr|.*position|.*translation|.*location)?"
@@ -31,6 +32,11 @@ def distinct_names(names: Sequence[str], padding: str = "") -> list[str]:
     """Number the repetitions of a name: intensity, intensity_2. The name of `padding` stays."""
     counts = [list(names[:k]).count(name) for k, name in enumerate(names, 1)]
     return [name if count == 1 or name == padding else f"{name}_{count}" for name, count in zip(names, counts)]
+
+
+def default_names(count: int) -> list[str]:
+    """Return the names of columns without names: x, y, z, column_3, ..."""
+    return [*AXES, *(f"column_{k}" for k in range(3, count))]
 
 
 def role_of_name(name: str) -> str | None:

@@ -263,6 +263,12 @@ def test_organised_arrays_have_a_row_per_point(tmp_path):
         assert np.array_equal(read_cloud(tmp_path / name), points.reshape(-1, 3))
         copy_rows(tmp_path / name, tmp_path / "few.npy", np.arange(32) < 5)
         assert np.array_equal(read_cloud(tmp_path / "few.npy"), points.reshape(-1, 3)[:5])
+    image = np.arange(4 * 64 * 1024, dtype=np.float32).reshape(64, 1024, 4)
+    np.save(tmp_path / "channels.npy", np.moveaxis(image, 2, 0))
+    assert np.array_equal(read_cloud(tmp_path / "channels.npy"), image.reshape(-1, 4)[:, :3])
+    np.savez(tmp_path / "organised.npz", pcl=image[..., :3], ring=image[..., 3], pose=np.eye(4))
+    assert np.array_equal(read_cloud(tmp_path / "organised.npz"), image.reshape(-1, 4)[:, :3])
+    assert np.array_equal(read_columns(tmp_path / "organised.npz")["ring"], image[..., 3].ravel())
     np.save(tmp_path / "turned.npy", points.reshape(-1, 3).repeat(9, axis=0).T)
     assert np.array_equal(read_cloud(tmp_path / "turned.npy"), points.reshape(-1, 3).repeat(9, axis=0))
 

@@ -9,11 +9,10 @@ import pyarrow as pa
 from pyarrow import csv
 
 from cflow_torch.data.arrays.tables import split_line, start_of_rows
-from cflow_torch.data.column_names import distinct_names, role_of_name
+from cflow_torch.data.column_names import AXES, default_names, distinct_names, role_of_name
 from cflow_torch.types import CFlowError
 
 SUFFIXES = (".csv", ".txt", ".xyz", ".pts", ".asc")
-_AXES = ("x", "y", "z")
 _START = 1 << 16  # bytes that tell the columns
 
 
@@ -24,8 +23,8 @@ def text_columns(content: bytes) -> dict[str, np.ndarray]:
     `start_of_rows` finds. Empty numbers are NaN.
     """
     lines = [line.strip() for line in content[:_START].decode("utf-8-sig", "replace").splitlines()]
-    start, names = start_of_rows(lines, len(_AXES))
-    if start == len(lines) or len(split_line(lines[start])) < len(_AXES):
+    start, names = start_of_rows(lines, len(AXES))
+    if start == len(lines) or len(split_line(lines[start])) < len(AXES):
         raise CFlowError("it has no line of three or more numbers below its names; it needs x, y, z")
     first = lines[start]
     separator = next((mark for mark in ";," if mark in first), " ")
@@ -42,13 +41,13 @@ def text_columns(content: bytes) -> dict[str, np.ndarray]:
     }
     table = csv.read_csv(pa.BufferReader(content), **options)
     columns = [column.to_numpy() for column in table.columns]
-    names = _with_axes(names) if names else [*_AXES, *(f"column_{k}" for k in range(3, count))]
+    names = _with_axes(names) if names else default_names(count)
     return {name: values for name, values in zip(names, columns) if values.dtype.kind in "biuf"}
 
 
 def _with_axes(names: list[str]) -> list[str]:
     """Return distinct names, of which those of a position are x, y and z."""
-    if not set(_AXES) <= set(names):
+    if not set(AXES) <= set(names):
         roles = [role_of_name(name) for name in names]
-        names = [role if role in _AXES and roles.index(role) == k else names[k] for k, role in enumerate(roles)]
+        names = [role if role in AXES and roles.index(role) == k else names[k] for k, role in enumerate(roles)]
     return distinct_names(names)

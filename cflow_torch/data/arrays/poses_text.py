@@ -36,7 +36,7 @@ _UNNAMED = {7: _TUM[1:], 8: _TUM, 12: MATRIX, 13: ("time", *MATRIX), 16: MATRIX,
 _UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four are not a quaternion; 6 have no time
 STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz", ".npy")
 """Suffixes of files that must be whole to be read, see `tables_of_values`."""
-_NAMES = "write all digits, and name the sweeps in the order of their times"
+_IN_ORDER = "write all digits, a line per sweep, in the order of their times"
 _LEAST_STEP = 0.1  # metres; shorter steps do not tell where the vehicle heads
 _INVERSE = ("extrinsic", "world2", "world_to", "w2c")  # in names of matrices that map the world to the sensor
 
@@ -67,8 +67,7 @@ def read_poses(path: PathLike) -> Trajectory:
             raise CFlowError(f"{path} is a folder: its files must have one pose each")
         return Trajectory(np.concatenate(poses), None, False, str(path), [file.stem for file in files])
     with file_errors(path):
-        content = read_bytes(path)
-    return parse_poses(content, path)
+        return parse_poses(read_bytes(path), path)
 
 
 def files_of_poses(folder: Path) -> list[Path]:
@@ -79,11 +78,6 @@ def files_of_poses(folder: Path) -> list[Path]:
 
 def parse_poses(content: bytes, path: Path) -> Trajectory:
     """Return the poses in the content of a file of text or `STRUCTURED`."""
-    with file_errors(path):
-        return _poses_in(content, path)
-
-
-def _poses_in(content: bytes, path: Path) -> Trajectory:
     if suffix_of(path) == ".npy":
         numbers = parse_npy(content, path, "pass a .npy file of (K, 4, 4) numbers")
         if numbers.shape in ((3, 4), (4, 4)):  # of a folder with a file per pose
@@ -247,24 +241,21 @@ def read_times(path: PathLike, is_sorted: bool = True) -> np.ndarray:
     sorted, pass False.
     """
     path = as_path(path)
-    with file_errors(path):
-        content = read_bytes(path)
-    return parse_times(content, path, is_sorted)
+    with file_errors(path, _IN_ORDER):
+        return parse_times(read_bytes(path), path, is_sorted)
 
 
 def parse_times(content: bytes, path: Path, is_sorted: bool = True) -> np.ndarray:
-    with file_errors(path, _NAMES):
-        names, words, _ = parse_table(content, path)
-        columns = (
-            {role_of_name(name): column for column, name in enumerate(names)} if words.shape[1] > 1 else {"time": 0}
-        )
-        if "time" not in columns:
-            raise CFlowError(f"{path} must have one time per line, or a column called time")
-        times: np.ndarray = np.array(nanoseconds_of_numbers(words[:, columns["time"]].tolist()), np.int64)
-        return _ascending(path, times) if is_sorted else times
+    names, words, _ = parse_table(content, path)
+    columns = [column for column, name in enumerate(names) if role_of_name(name) == "time"]
+    if words.shape[1] > 1 and not columns:
+        raise CFlowError(f"{path} must have one time per line, or a column called time")
+    words = words[:, columns[0] if columns else 0]
+    times: np.ndarray = np.array(nanoseconds_of_numbers(words.tolist()), np.int64)
+    return _ascending(path, times, _IN_ORDER) if is_sorted else times
 
 
-def _ascending(path: Path, times: np.ndarray, fix: str = _NAMES) -> np.ndarray:
+def _ascending(path: Path, times: np.ndarray, fix: str) -> np.ndarray:
     """Return (K,) int64 nanoseconds, which must ascend; `fix` says how to correct those that do not."""
     falls = np.diff(times) <= 0
     if falls.any():
