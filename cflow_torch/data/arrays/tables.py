@@ -50,7 +50,8 @@ def parse_table(content: bytes, path: Path) -> Table:
         start, names = start_of_rows(lines, _FEWEST_NUMBERS)
         rows = [split_line(line) for line in lines[start:] if not line.startswith(COMMENTS)]
         has_text = sum(_has_letters(line) and not line.startswith(COMMENTS) for line in lines[:start]) > 1
-        if has_text or len(set(map(len, rows))) != 1:
+        width = min(map(len, rows), default=0)
+        if has_text or not rows or any(any(row[width:]) for row in rows):  # the last line may lack a comma at its end
             raise ValueError("it is empty, or has text before its numbers" if start else "its lines differ in length")
         columns = list(map(_seconds_of_dates, zip(*rows)))
         kept = [k for k, column in enumerate(columns) if is_number(next(filter(None, column), ""))]
