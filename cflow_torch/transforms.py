@@ -93,9 +93,10 @@ def upright_poses(heading_centre: Any) -> np.ndarray:
     return as_matrix(rotations_about(2, values[:, 0]), values[:, 1:])
 
 
-def turn_of(T: np.ndarray) -> float:
-    """Return the angle of the rotation of a rigid transform, radians."""
-    return float(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
+def turn_of(T: np.ndarray) -> np.ndarray:
+    """Return the angles of the rotations of rigid transforms, (..., 4, 4): (...) float64, radians."""
+    trace = np.trace(T[..., :3, :3], axis1=-2, axis2=-1)
+    return np.arccos(np.clip((trace - 1) / 2, -1, 1))  # type: ignore[no-any-return]
 
 
 def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[int], str]) -> np.ndarray:
@@ -161,7 +162,7 @@ def interpolate_motion(poses0: np.ndarray, poses1: np.ndarray, fraction: np.ndar
     """
     result = interpolate_poses(poses0, poses1, fraction)
     steps = np.linalg.inv(poses0) @ poses1
-    angle = np.array([turn_of(step) for step in steps])
+    angle = turn_of(steps)
     is_arc = np.linalg.norm(steps[:, :3, 3], axis=1) * angle / 8 > _FLATTEST
     steps, angle, share = steps[is_arc], angle[is_arc], fraction[is_arc]
     cross = (steps[:, :3, :3] - steps[:, :3, :3].transpose(0, 2, 1)) / (2 * np.sin(angle)[:, None, None])

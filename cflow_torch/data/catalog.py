@@ -15,7 +15,7 @@ from cflow_torch.data.deskewing import DeskewedLog, check_deskew
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.finding import FOUND, Finding
 from cflow_torch.data.folders import distinct_names, find_folders, visible
-from cflow_torch.data.log import CachedLog, Log, LogWrapper
+from cflow_torch.data.log import CachedLog, Log, LogWrapper, add_gaps_in_time
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, exist, is_path_like, remote_errors, safe_name, suffix_of
@@ -307,6 +307,7 @@ def open_log(
         deskew = "off" if moves and deskew == "times" and log.is_compensated else deskew  # the reader did it
     log.log_id = new_name or log.log_id
     safe_name(log.log_id, f"{source}: the log")  # names the folder of its results
+    add_gaps_in_time(log)
     if odometry:
         from cflow_torch.data.odometry import with_poses
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.finding import FOUND, Finding
+from cflow_torch.data.finding import FOUND, RIGHT, Finding
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper, intervals_of
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.diagnosis.readings import Judgement
@@ -73,7 +73,17 @@ class DeskewedLog(LogWrapper):
 
     def findings(self) -> list[Finding]:
         note = self._note_of(self.scan) if self._deskew == "auto" else ""
-        return [*self.log.findings(), *([Finding("de-skewing", FOUND, note, True)] if note else [])]
+        found = Finding("de-skewing", FOUND, note, True) if note else Finding("de-skewing", RIGHT, self._describe())
+        return [*self.log.findings(), found]
+
+    def _describe(self) -> str:
+        if self._deskew != "auto":
+            return f"as you say, deskew={self._deskew}"
+        times = self.log.sweep(0).point_times
+        if times is None:
+            return "no times of points, and no other reading fits clearly better than as stored"
+        spread = np.ptp(as_numpy(times)) if len(times) else 0.0
+        return f"points have times over {spread:.3f} s"
 
     @cached_property
     def _scans(self) -> tuple[str, ...]:
@@ -114,7 +124,10 @@ class DeskewedLog(LogWrapper):
     def sweep(self, index: int) -> Sweep:
         reading = self.scan
         sweep = self.log.sweep(index)
-        if reading == "off" or sweep.pose is None:
+        if reading == "off":
+            return sweep
+        if sweep.pose is None:
+            self._note(f"deskew={reading} needs poses, and sweep {index} has none: try data.odometry=true", "no poses")
             return sweep
         if reading == "times" != self._deskew and sweep.point_times is None:
             self._note(f"sweep {index} has no times of points and stays as it is, also others", "sweeps without times")
@@ -142,6 +155,10 @@ class DeskewedLog(LogWrapper):
             return self._move_along(self.trajectory, points, seconds, index)
         before = max(index - 1, 0)
         after = min(index, len(self) - 2)
+        if before in self.gaps:  # the motion over a gap does not tell that within a sweep
+            before = after
+        elif after in self.gaps:
+            after = before
         gaps = self._gaps[[before, after]]
         if reading != "times":  # A pose interval is one turn, or several if sweeps are missing: stamps may be rounded.
             gaps = self._interval * np.maximum(np.round(gaps / self._interval), 1)
@@ -150,10 +167,11 @@ class DeskewedLog(LogWrapper):
 
     def _move_along(self, trajectory: Any, points: np.ndarray, seconds: np.ndarray, index: int) -> np.ndarray:
         """Move points by a trajectory that has more poses than one per sweep."""
-        shots, group = np.unique(np.round(seconds / _SLICE).astype(np.int64), return_inverse=True)
+        of_point = np.round(np.nan_to_num(seconds) / _SLICE).astype(np.int64)
+        shots, group = np.unique(of_point, return_inverse=True)
         at = poses_at(self.timestamps[index] + shots * round(_SLICE * 1e9), *trajectory)
         poses: Any = self.poses
-        return transform_each(points, (np.linalg.inv(poses[index]) @ at)[group]).astype(points.dtype)
+        return transform_each(points[:, :3], (np.linalg.inv(poses[index]) @ at)[group]).astype(points.dtype)
 
     def labels(self, index: int) -> FlowLabels | None:
         labels = self.log.labels(index)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Sequence
 
 import numpy as np
@@ -11,7 +12,9 @@ from pyarrow import feather
 
 from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import PathLike, as_path, is_remote, read_bytes
+from cflow_torch.errors import MissingFile
 from cflow_torch.types import VECTORS, Array, CFlowError, FlowResult, as_numpy, vector_columns
 
 CONTENTS = (*VECTORS, "cluster_id", "score", "is_valid")
@@ -66,7 +69,8 @@ def add_track_ids(path: PathLike, track_id: np.ndarray) -> None:
 def has_track_ids(path: PathLike) -> bool:
     """Test whether a flow file has the column `track_id`. Of a local file, only the footer is read."""
     path = as_path(path)
-    with pa.BufferReader(read_bytes(path)) if is_remote(path) else pa.memory_map(str(path)) as source:
+    opened = partial(pa.memory_map, str(path)) if not is_remote(path) else lambda: pa.BufferReader(read_bytes(path))
+    with file_errors(path), opened() as source:
         return TRACK_ID in pa.ipc.open_file(source).schema.names
 
 
@@ -85,6 +89,8 @@ def read_flow(path: PathLike) -> FlowResult:
                 fields[VECTORS.get(name, name)] = torch.from_numpy(values if name in VECTORS else values[:, 0])
         if not fields:
             raise CFlowError(f"its columns are {', '.join(file.names)}")
+    except MissingFile:
+        raise
     except CFlowError as error:
         raise CFlowError(f"{path} is not a flow file ({error}): pass one that `cflow flow` wrote") from error
     return FlowResult.of(fields)

@@ -51,8 +51,8 @@ class Log(ABC):
     Attributes:
         log_id: name of the log, safe as a folder name; the name of its file or folder unless the reader says otherwise.
         timestamps: sweep times, nanoseconds, ascending; other ascending numbers if the sweeps have no `timestamp_ns`.
-        gaps: indices of sweeps after which the reader left out sweeps. No window reaches over a gap for its history or
-            future, and `cflow flow` leaves out the pair over it.
+        gaps: indices of sweeps after which sweeps are left out; `open_log` adds those after which none follows for
+            long. No history or future of a window reaches over a gap, and the commands leave out the pair over it.
         is_compensated: True = the format is known to be compensated for ego motion within a sweep.
         has_raw_times: True = sweeps with `point_times` are expected not to be compensated.
         has_sparse_poses: True = most poses are interpolated between sweeps.
@@ -84,9 +84,9 @@ class Log(ABC):
         """Read sweep `index`: float32 points, float64 pose `T_world_ego`, ground mask, time."""
 
     def labels(self, index: int) -> FlowLabels | None:
-        """Read the truth of the pair (index, index + 1); None for the last sweep, and where the log has none."""
+        """Read the truth of the pair (index, index + 1); None for the last sweep, at a gap, and if the log has none."""
         self._timestamp(index)
-        return self._labels(index) if index < len(self) - 1 else None
+        return self._labels(index) if index < len(self) - 1 and index not in self.gaps else None
 
     def _labels(self, index: int) -> FlowLabels | None:
         """Read the truth of a pair that exists."""
@@ -111,8 +111,16 @@ class Log(ABC):
 
     @cached_property
     def surrounds_poses(self) -> bool:
-        """Whether points lie around the positions of their poses, see `points_surround_poses`."""
-        return points_surround_poses(self)
+        """Whether points lie around the position of their pose, by the sweep that is farthest from the origin.
+
+        Cost: reads this sweep if it is at least 3 m from the origin.
+        """
+        poses = known_poses(self)
+        if poses is None:
+            return False
+        distance = np.linalg.norm(poses[:, :2, 3], axis=1)
+        farthest = int(distance.argmax())
+        return bool(distance[farthest] >= LEAST_DISTANCE) and is_around(self.sweep(farthest).points, poses[farthest])
 
     @property
     def judgement(self) -> Judgement | None:
@@ -227,15 +235,6 @@ class Log(ABC):
             raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self) - 1}, you asked for {index}")
         return self.timestamps[index]
 
-    def _with_gaps_in_time(self, known: Sequence[int] = ()) -> frozenset[int]:
-        """Return the gaps, and those after which no sweep follows for long, which we tell. Stamps are nanoseconds."""
-        steps = np.diff(self.timestamps) * 1e-9
-        gaps = [gap for gap in gaps_in(steps) if gap not in known]
-        if gaps:
-            first = f"the first is {steps[gaps[0]]:.2g} s long, after sweep {gaps[0]}"
-            self._note(f"it has {len(gaps)} gaps between sweeps ({first}); no window reaches over them")
-        return frozenset({*known, *gaps})
-
     def _check_count(self, where: Any) -> None:
         """Refuse a log without a pair of sweeps; `where` begins the message."""
         if len(self.timestamps) < 2:
@@ -281,17 +280,14 @@ def gaps_in(steps: np.ndarray) -> list[int]:
     return np.flatnonzero((steps > _GAP * np.median(steps)) & (steps > _LONGEST_STEP)).tolist()  # type: ignore[no-any-return]
 
 
-def points_surround_poses(log: Log) -> bool:
-    """Test whether points lie around the position of their pose, by the sweep that is farthest from the origin.
-
-    Cost: reads this sweep if it is at least 3 m from the origin.
-    """
-    poses = known_poses(log)
-    if poses is None:
-        return False
-    distance = np.linalg.norm(poses[:, :2, 3], axis=1)
-    farthest = int(distance.argmax())
-    return bool(distance[farthest] >= LEAST_DISTANCE) and is_around(log.sweep(farthest).points, poses[farthest])
+def add_gaps_in_time(log: Log) -> None:
+    """Add the gaps after which no sweep follows for long to those of a log, with a note. Stamps are nanoseconds."""
+    steps = np.diff(log.timestamps) * 1e-9
+    gaps = [gap for gap in gaps_in(steps) if gap not in log.gaps]
+    if gaps:
+        first = f"the first is {steps[gaps[0]]:.2g} s long, after sweep {gaps[0]}"
+        log._note(f"it has {len(gaps)} gaps between sweeps ({first}); no window reaches over them")
+        log.gaps = log.gaps.union(gaps)
 
 
 def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> Window:
@@ -382,7 +378,7 @@ class _OfLog:
 
 
 for _name in (
-    *("labels", "columns", "cameras", "poses", "trajectory", "readings", "surrounds_poses", "judgement", "findings"),
+    *("labels", "columns", "cameras", "poses", "trajectory", "readings", "judgement", "findings"),
     *("eval_mask", "stored_motion", "moving", "units", "boxes", "T_camera0_lidar", "sample_tokens"),
     "sweep_name",
     *("notes", "_note", "close", "unwrapped"),
@@ -401,13 +397,10 @@ class CachedLog(LogWrapper):
     def __reduce__(self) -> Any:
         return CachedLog, (self.log, self._count)
 
-    @cached_property
-    def surrounds_poses(self) -> bool:
-        return points_surround_poses(self)
-
     def sweep(self, index: int) -> Sweep:
         return self._sweep(index)
 
     def stop(self) -> None:
         """Forget the sweeps, and keep none from now on, so that callers may write into what they get."""
-        self._sweep = self.log.sweep
+        self._count = 0
+        self._sweep = lru_cache(0)(self.log.sweep)

@@ -10,10 +10,10 @@ import numpy as np
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses
 from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, judge_log
-from cflow_torch.data.neighbours import Neighbours, alternate
+from cflow_torch.data.neighbours import Neighbours, middle_sweeps
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.diagnosis.conventions import OF_POINTS, READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
-from cflow_torch.diagnosis.inspection import REPEATED, repeats
+from cflow_torch.diagnosis.inspection import repeats
 from cflow_torch.diagnosis.point_frame import frame_problem
 from cflow_torch.diagnosis.readings import (
     EQUAL,
@@ -24,13 +24,14 @@ from cflow_torch.diagnosis.readings import (
     Judgement,
     difference,
 )
-from cflow_torch.diagnosis.stillness import IN_PLACE, LEAST_SHARE, Structure, are_finite, share_in_place, structure_of
+from cflow_torch.diagnosis.stillness import IN_PLACE, LEAST_SHARE, Structure, are_finite, share_of_sweeps
 from cflow_torch.errors import CFlowError, warn
+from cflow_torch.ground.segmentation import find_ground
 from cflow_torch.transforms import relative_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
 
 _CACHED = 12  # sweeps that several checks read
-_INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
+_MISFIT = 0.3  # correlation of a ground mask with the ground that we find; of right ones, 0.87 to 0.97
 _STRIP = 4.0  # metres, half width of the strip whose points are looked for in the next sweep
 _SAMPLE = 1000  # points of the strip that are looked for
 _SAME = 0.001  # metres between two equal points
@@ -79,11 +80,13 @@ class _CheckedLog(CachedLog):
     @cached_property
     def misfit(self) -> list[Finding]:
         """Why neighbouring sweeps do not fit whatever the poses: they measure other directions, or alternate."""
-        return _parts(self) or ([_TWO_SENSORS] if alternate(self) else [])
+        parts = _parts(self)
+        return parts or ([_TWO_SENSORS] if Neighbours.of(self, middle_sweeps(self)).alternate else [])
 
     @cached_property
     def lapses(self) -> list[Lapse]:
-        return find_lapses(self)
+        """Single wrong poses, if no other reading of all poses fits better."""
+        return [] if self.motion.best else find_lapses(self)
 
 
 _Check = Callable[[_CheckedLog], List[Finding]]
@@ -118,7 +121,6 @@ def examine(log: Log) -> list[Finding]:
         _times,
         _poses,
         _lapses,
-        _deskew,
         _repeated,
         _each_sweep,
         _mask,
@@ -178,15 +180,11 @@ def _fitting(log: Log, readings: Iterable[str]) -> tuple[str, float]:
     """
     middle = (len(log.timestamps) - 2) // 2
     logs = ((name, ReadAs(log, name)) for name in readings)
-    fitting_at_all = ((name, read) for name, read in logs if _share_of_pair(read, middle) >= LEAST_SHARE)
+    pairs = ((name, read, read.sweep(middle), read.sweep(middle + 1)) for name, read in logs)
+    fitting_at_all = ((name, read) for name, read, *pair in pairs if share_of_sweeps(*pair) >= LEAST_SHARE)
     judged = ((name, judge_log(read)) for name, read in fitting_at_all)
     fitting = ((name, each.given) for name, each in judged if not each.best and each.given >= LEAST_SHARE)
     return next(fitting, ("", 0.0))
-
-
-def _share_of_pair(log: Log, index: int) -> float:
-    pc0, pc1 = log.sweep(index), log.sweep(index + 1)
-    return share_in_place(pc0, structure_of(pc0), pc1, structure_of(pc1))
 
 
 def _problem_of(log: Log, index: int) -> tuple[str, str]:
@@ -259,7 +257,7 @@ def _setting(log: Log, reading: str) -> str:
 
 def _lapses(log: _CheckedLog) -> list[Finding]:
     wrong = [lapse for lapse in log.lapses if lapse.kind != MISSING]
-    if not wrong or INACCURATE in log.motion.best:  # then most poses are off
+    if not wrong:
         return []
     if log.misfit:
         return log.misfit
@@ -278,34 +276,35 @@ def _mask(log: Log) -> list[Finding]:
     if sweep.is_ground is None:
         return [Finding("ground", RIGHT, "no masks, so no point is taken for ground (data.find_ground=grid finds it)")]
     mask = as_numpy(sweep.is_ground)
-    above = _median_height(sweep, ~mask) - _median_height(sweep, mask)
-    if above < -_INVERTED_BY:
-        text = f"the points masked as ground lie {-above:.1f} m above the others: invert the mask, True = ground"
-        return [Finding("ground", WRONG, text, True)]
     share = float(mask.mean()) if len(mask) else 0.0
-    return [Finding("ground", RIGHT, f"{100 * share:.0f} % of the points of the first sweep", True)]
+    text = f"{100 * share:.0f} % of the points of the first sweep"
+    fix = ""
+    if share == 1:
+        fix = "so no point would have flow: give masks of the ground alone, or none"
+    elif share > 0 and not _problem_of(log, 0)[1]:
+        fit = _fit_of_mask(as_numpy(sweep.points)[:, :3], mask)
+        fix = "invert the mask, True = ground" if fit < -_MISFIT else fix
+        fix = "has it the rows of this sweep, in their order?" if abs(fit) <= _MISFIT else fix
+        text += ", which are not those that lie low" if fix else ""
+    return [Finding("ground", WRONG if fix else RIGHT, f"{text}: {fix}" if fix else text, True)]
 
 
-def _median_height(sweep: Sweep, rows: np.ndarray) -> float:
-    heights = as_numpy(sweep.points)[rows, 2]
-    heights = heights[np.isfinite(heights)]
-    return float(np.median(heights)) if len(heights) else float("nan")
-
-
-def _deskew(log: Log) -> list[Finding]:
-    sweep = log.sweep(0)
-    if any(finding.topic == "de-skewing" for finding in log.findings()):
-        return []
-    if sweep.point_times is not None:
-        spread = np.ptp(as_numpy(sweep.point_times)) if len(sweep.point_times) else 0.0
-        return [Finding("de-skewing", RIGHT, f"points have times over {spread:.3f} s", True)]
-    return [Finding("de-skewing", RIGHT, "no times of points, and no other reading fits clearly better than as stored")]
+def _fit_of_mask(points: np.ndarray, mask: np.ndarray) -> float:
+    """Return the correlation of a ground mask with the ground that we find; 1 if that is none, or all points."""
+    rows = slice(None, None, len(points) // _MOST_SEEN + 1)
+    found = as_numpy(find_ground(points[rows]))
+    is_known = are_finite(points[rows])
+    if not is_known.any():
+        return 1.0
+    both = np.stack([found[is_known], mask[rows][is_known]]).astype(np.float64)
+    return float(np.corrcoef(both)[0, 1]) if (np.ptp(both, axis=1) > 0).all() else 1.0
 
 
 def _repeated(log: Log) -> list[Finding]:
     first = [log.sweep(index) for index in range(2)]
     if repeats(*first):
-        return [Finding("sweeps", WRONG, REPEATED, True)]
+        text = "sweep 1 repeats the points of sweep 0: leave one out, or copy its file again"
+        return [Finding("sweeps", WRONG, text, True)]
     is_known = _is_grid(first[0]) or bool(frame_problem(first[0].points)[0])  # then "to the millimetre" means nothing
     again = 0.0 if is_known else _share_again(*first)
     if again > _ACCUMULATED:
@@ -378,7 +377,7 @@ def _directions(sweep: Sweep) -> np.ndarray:
 def _each_sweep(log: _CheckedLog) -> list[Finding]:
     """Read every sweep: find those that cannot be read, have few points, repeat the one before, or are misplaced."""
     log.sweep(0)  # its error is that of the log
-    neighbours = Neighbours.of(log)
+    neighbours = Neighbours.of(log, range(len(log)))
     return [*_unreadable(neighbours), *_small(neighbours), *_misplaced(log, neighbours)]
 
 
@@ -423,7 +422,7 @@ def _misplaced(log: _CheckedLog, neighbours: Neighbours) -> list[Finding]:
             continue
         if last < first:
             what = f"sweeps {last} and {first} do not fit each other, while those around do"
-            fix = "are sweeps missing between them, or do poses jump? Split the log there"
+            fix = "are sweeps missing between them, or do poses jump? Give the parts as logs of their own"
         else:
             what = f"sweep {first} does" if first == last else f"sweeps {first} to {last} do"
             what += " not fit those around"
@@ -480,9 +479,7 @@ def _times(log: Log) -> list[Finding]:
     if gaps:
         longest = max(gaps, key=interval.__getitem__)
         text += f"; {len(gaps)} gaps, the longest of {interval[longest]:.1f} s after sweep {longest}"
-        if set(gaps) <= log.gaps:
-            return [Finding("times", FOUND, f"{text}. No window reaches over them")]
-        return [Finding("times", WRONG, f"{text}: split the log there")]
+        return [Finding("times", FOUND, f"{text}. No window reaches over them")]
     if not 0.01 <= usual <= 1:
         return [Finding("times", WRONG, f"{text}: are the times in the unit that the reader expects?")]
     if _change(interval) > _UNEVEN:

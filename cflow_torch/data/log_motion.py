@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Callable, Container, Iterator, NamedTuple, Sequence
+from typing import Callable, Collection, Iterator, NamedTuple, Sequence
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from cflow_torch.diagnosis.readings import (
 from cflow_torch.transforms import turn_of
 
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
-_BEFORE = 100  # sweeps before a suspect step, from whose poses other readings of it follow
 _CHANGES = (-4, -1, 1, 4)  # sweeps between a pair and those whose motion should differ
 _REACH = 10  # sweeps before and after a pair, whose poses may be those of the pair
 # Metres a sweep, of points 20 m away. If it is less, a wrong direction moves static objects by millimetres only.
@@ -35,8 +34,9 @@ _LEAST_MOTION = 0.2  # metres between the sweeps of a pair, else the vehicle sta
 _SUSPECT, _SUSPECT_SHARE = 0.2, 0.3
 _ARM = 10.0  # metres; a rotation counts as the motion of a point that far away
 _FEWEST_POSES = 5  # that tell a usual step
+_AROUND = (-3, -2, -1, 1, 2, 3)  # steps that tell it
 POSE, JUMP, MISSING = "pose", "jump", "missing"
-_OTHER, _CLEARLY = "another step", 1.3  # factor by which another reading is better than another step
+_OTHER = "another step"
 _NUM_SUSPECTS = 4  # steps that are compared with the points, largest first
 _LONG = 1.7  # length of a step over all those around it, if sweeps are missing
 
@@ -50,7 +50,7 @@ class Lapse(NamedTuple):
 
 
 def choose_pairs(
-    num_sweeps: int, poses: np.ndarray | None, jumps: Sequence[int] = (), without: Container[int] = ()
+    num_sweeps: int, poses: np.ndarray | None, jumps: Sequence[int] = (), without: Collection[int] = ()
 ) -> list[tuple[int, int]]:
     """Choose pairs of sweeps that show wrong readings best, up to three, in order.
 
@@ -60,50 +60,67 @@ def choose_pairs(
     of it reaches over the steps `jumps`, if others are left. No pair has a sweep that is in `without`. Without poses,
     and if the vehicle does not move, they are neighbours spread over the log.
     """
-    firsts = range(num_sweeps - 1)
-    pairs = [] if poses is None else [(first, _partner(poses, first, jumps)) for first in firsts]
-    pairs = [pair for pair in pairs if pair[0] not in without and pair[1] not in without]
-    if poses is not None and not pairs:
-        return []
-    if poses is None or max(difference(_motion(poses, *pair), np.eye(4)) for pair in pairs) < _LEAST_MOTION:
+    first = np.arange(num_sweeps - 1)
+    second = first + 1
+    rows: np.ndarray = first  # of the pairs that may be chosen
+    if poses is not None:
+        second = first + _num_intervals(poses, jumps)
+        rows = first[~(np.isin(first, [*without]) | np.isin(second, [*without]))]
+        if len(rows) == 0:
+            return []
+    if poses is None or difference(_motions(poses, first[rows], second[rows]), np.eye(4)).max() < _LEAST_MOTION:
         spread = {min(num_sweeps * part // 6, num_sweeps - 2) for part in (1, 3, 5)}
-        return [(first, first + 1) for first in sorted(spread)]
-    smooth = [pair for pair in pairs if pair[0] not in jumps] or pairs
-    inner = [pair for pair in smooth if pair[0] > 0 and pair[1] + 1 < num_sweeps]  # with poses before and after
-    inner = [pair for pair in inner if not {pair[0] - 1, pair[1]} & set(jumps)] or inner
-    criteria = (partial(_turn, poses), partial(_speed, poses), *([partial(_change, poses)] if inner else []))
-    return sorted({max(inner or smooth, key=lambda pair: criterion(*pair)) for criterion in criteria})
+        return [(index, index + 1) for index in sorted(spread)]
+    has_neighbours = (first > 0) & (second + 1 < num_sweeps)
+    rows = _preferred(rows, ~np.isin(first, jumps))
+    rows = _preferred(rows, has_neighbours)
+    rows = _preferred(rows, ~(np.isin(first - 1, jumps) | np.isin(second, jumps)))
+    first, second = first[rows], second[rows]
+    turn = turn_of(_motions(poses, first, second))
+    criteria = [turn, _speeds(poses, first, second)]
+    if has_neighbours[rows].any():
+        criteria.append(_changes(poses, first, second))
+    chosen = {int(criterion.argmax()) for criterion in criteria}  # ties: the first
+    return [(int(first[row]), int(second[row])) for row in sorted(chosen)]
 
 
-def _partner(poses: np.ndarray, first: int, jumps: Sequence[int]) -> int:
-    last = min([first + _MOST_SWEEPS, len(poses) - 1, *(step for step in jumps if step > first)])
-    near = np.linalg.norm(poses[first + 1 : last + 1, :3, 3] - poses[first, :3, 3], axis=1) < _LONGEST_STEP
-    return first + 1 + max(int(near.cumprod().sum()) - 1, 0)
+def _preferred(rows: np.ndarray, is_preferred: np.ndarray) -> np.ndarray:
+    """Return the rows that are preferred, or all if none is."""
+    preferred = rows[is_preferred[rows]]
+    return preferred if len(preferred) else rows
 
 
-def _motion(poses: np.ndarray, first: int, second: int) -> np.ndarray:
-    return np.linalg.inv(poses[second]) @ poses[first]
+def _num_intervals(poses: np.ndarray, jumps: Sequence[int]) -> np.ndarray:
+    """Return how many sweeps later the pair of each sweep but the last one ends, (K-1,) int64, see `choose_pairs`."""
+    first = np.arange(len(poses) - 1)[:, None]
+    second = first + np.arange(1, _MOST_SWEEPS + 1)
+    ends = np.array([*sorted(jumps), len(poses) - 1])
+    last = ends[np.searchsorted(ends, first, side="right").clip(max=len(ends) - 1)]
+    position = poses[:, :3, 3]
+    distance = np.linalg.norm(position[second.clip(max=len(poses) - 1)] - position[first], axis=2)
+    is_near = (second <= last) & (distance < _LONGEST_STEP)
+    return is_near.cumprod(1).sum(1).clip(min=1)  # type: ignore[no-any-return]
 
 
-def _speed(poses: np.ndarray, first: int, second: int) -> float:
-    """Return the metres that the vehicle moves in a sweep interval of a pair."""
-    return float(np.linalg.norm(poses[second, :3, 3] - poses[first, :3, 3])) / (second - first)
+def _motions(poses: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the motions from sweeps to others, (n, 4, 4), of which the indices are given, (n,) each."""
+    return np.linalg.inv(poses[second]) @ poses[first]  # type: ignore[no-any-return]
 
 
-def _usual_speed(poses: np.ndarray) -> float:
-    """Return the median metres between neighbouring poses, rotations at 20 m."""
-    return float(np.median([difference(_motion(poses, k, k + 1), np.eye(4)) for k in range(len(poses) - 1)]))
+def _speeds(poses: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the metres that the vehicle moves in a sweep interval of each pair, (n,)."""
+    return np.linalg.norm(poses[second, :3, 3] - poses[first, :3, 3], axis=1) / (second - first)  # type: ignore[no-any-return]
 
 
-def _turn(poses: np.ndarray, first: int, second: int) -> float:
-    return turn_of(_motion(poses, first, second))
-
-
-def _change(poses: np.ndarray, first: int, second: int) -> float:
-    """Return how much the motion of a pair differs from that some sweeps earlier and later, metres."""
-    given = _motion(poses, first, second)
-    firsts = [first + step for step in _CHANGES if first + step >= 0 and second + step < len(poses)]
-    return sum(difference(given, _motion(poses, other, other + second - first)) for other in firsts)
+def _changes(poses: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return how much the motion of each pair differs from that some sweeps earlier and later, (n,) metres."""
+    given = _motions(poses, first, second)
+    change = np.zeros(len(first))
+    for step in _CHANGES:
+        inside = np.flatnonzero((first + step >= 0) & (second + step < len(poses)))
+        other = _motions(poses, first[inside] + step, second[inside] + step)
+        change[inside] += difference(given[inside], other)
+    return change
 
 
 def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: Sequence[str] = (OFF,)) -> Judgement:
@@ -133,7 +150,7 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
         again = judge(make_pairs(others, scans, False)) if judgement.best and others else judgement
         judgement = again if _contradicts(again, judgement) else judgement
     is_unclear = not judgement.best and judgement.given < _UNCLEAR
-    if poses is not None and is_unclear and _usual_speed(poses) < _LEAST_TIMED:
+    if poses is not None and is_unclear and _hardly_move(poses):
         spread = choose_pairs(len(log.timestamps), None)
         clouds = [[replace(log.sweep(index), pose=None) for index in pair] for pair in spread]
         unposed = judge(make_pair(pc0, pc1) for pc0, pc1 in clouds)
@@ -143,11 +160,17 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     return judgement
 
 
+def _hardly_move(poses: np.ndarray) -> bool:
+    """Test whether points 20 m away move by less than 0.1 m in most sweep intervals."""
+    first = np.arange(len(poses) - 1)
+    return bool(np.median(difference(_motions(poses, first, first + 1), np.eye(4))) < _LEAST_TIMED)
+
+
 def _pairs_without_repeats(
-    log: Log, poses: np.ndarray, jumps: Sequence[int], without: Container[int]
+    log: Log, poses: np.ndarray, jumps: Sequence[int], without: Collection[int]
 ) -> list[tuple[int, int]]:
     """Choose pairs of sweeps that are not in `without`, and do not repeat the one before."""
-    excluded = {index for index in range(len(log.timestamps)) if index in without}
+    excluded = set(without)
     while True:
         pairs = choose_pairs(len(log.timestamps), poses, jumps, excluded)
         sweeps = {index for pair in pairs for index in pair if index > 0}
@@ -184,7 +207,10 @@ def _make_pairs(
         start = max(first - _REACH, -num_before)
         around = None if extended is None else extended[start + num_before : second + num_before + _REACH + 1]
         least = _LEAST_TIMED if TIMES in scans else _LEAST_SPEED
-        is_fast = poses is not None and difference(_motion(poses, first, second), np.eye(4)) >= least * (second - first)
+        is_fast = False
+        if poses is not None:
+            motion = np.linalg.inv(poses[second]) @ poses[first]
+            is_fast = bool(difference(motion, np.eye(4)) >= least * (second - first))
         how = {} if deskew is None else {"deskew": [partial(deskew, index) for index in (first, second)]}
         shown = scans if is_fast else scans[:1]
         rows = (0, 1) if around is None else (first - start, second - start)
@@ -215,14 +241,16 @@ def steps_of(log: Log) -> Steps | None:
     steps = np.linalg.inv(poses[1:]) @ poses[:-1]
     interval = np.diff(np.asarray(log.timestamps, np.float64)).clip(1e-9)
     rate = steps[:, :3, 3] / interval[:, None]
-    usual = np.empty_like(steps)
-    longest = np.zeros(len(steps))
-    for index in range(len(steps)):
-        around = [k for k in range(index - 3, index + 4) if 0 <= k < len(steps) and k != index]
-        turns = np.arctan2(steps[around, 1, 0], steps[around, 0, 0])
-        usual[index] = steps[around[int(np.argsort(turns, kind="stable")[len(around) // 2])]]  # of median rotation
-        usual[index, :3, 3] = np.median(rate[around], 0) * interval[index]
-        longest[index] = np.linalg.norm(rate[around], axis=1).max() * interval[index]
+    turn = np.arctan2(steps[:, 1, 0], steps[:, 0, 0])
+    around = np.arange(len(steps))[:, None] + _AROUND  # [K-1, 6]
+    is_step = (around >= 0) & (around < len(steps))
+    around = around.clip(0, len(steps) - 1)
+    by_turn = np.where(is_step, turn[around], np.inf).argsort(1, kind="stable")
+    middle = np.take_along_axis(by_turn, is_step.sum(1, keepdims=True) // 2, 1)
+    usual = steps[np.take_along_axis(around, middle, 1)[:, 0]]  # of the median rotation
+    rates = np.where(is_step[..., None], rate[around], np.nan)
+    usual[:, :3, 3] = np.nanmedian(rates, 1) * interval[:, None]
+    longest = np.nanmax(np.linalg.norm(rates, axis=2), 1) * interval
     excess = np.linalg.norm(steps[:, :3, 3] - usual[:, :3, 3], axis=1)
     excess += _ARM * np.linalg.norm(steps[:, :2, 0] - usual[:, :2, 0], axis=1)
     return Steps(steps, usual, longest, excess)
@@ -233,7 +261,7 @@ def find_lapses(log: Log) -> list[Lapse]:
 
     A step between neighbouring poses is suspect if it differs from the steps around it. We read the two sweeps of the
     most suspect steps, and compare the points under the step and under that of the neighbours. In logs with times,
-    steps are in proportion to them.
+    steps are in proportion to them. Give logs whose poses fit: another convention of poses changes steps, too.
     """
     steps = steps_of(log)
     if steps is None:
@@ -243,7 +271,7 @@ def find_lapses(log: Log) -> list[Lapse]:
         given, usual = steps.given[index], steps.usual[index]
         length = float(np.linalg.norm(given[:3, 3]))
         is_long = index not in log.gaps and length > _LONG * max(steps.longest[index], _LEAST_MOTION)
-        pair = _pair_around(log, index)
+        pair = make_pair(log.sweep(index), log.sweep(index + 1), in_world=False)
         if pair is None:
             continue
         if _is_contradicted(pair, given, usual):
@@ -256,18 +284,6 @@ def find_lapses(log: Log) -> list[Lapse]:
     return lapses
 
 
-def _pair_around(log: Log, index: int) -> Pair | None:
-    """Prepare sweep `index` and the next one, with the poses before them; None = they have too little structure."""
-    start = max(index - _BEFORE, 0)
-    poses = known_poses(log)
-    around = None if poses is None else poses[start : index + 2]
-    return make_pair(log.sweep(index), log.sweep(index + 1), around, (index - start, index + 1 - start), False)
-
-
 def _is_contradicted(pair: Pair, step: np.ndarray, other: np.ndarray) -> bool:
-    """Test whether the points fit best under another step, and not under another reading of all poses."""
-    transforms = {GIVEN: step, _OTHER: other}
-    if not judge([replace(pair, transforms=transforms, has_motion=True)]).best:
-        return False
-    shares = replace(pair, transforms={**pair.transforms, **transforms}).shares_of_poses(OFF)
-    return max(shares.values()) < max(_CLEARLY * shares[_OTHER], LEAST_SHARE)
+    """Test whether the points fit better under another step."""
+    return bool(judge([replace(pair, transforms={GIVEN: step, _OTHER: other}, has_motion=True)]).best)

@@ -6,13 +6,12 @@ Each sweep is aligned with the one before it, at first with far correspondences,
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from cflow_torch.data.log import Log, LogWrapper, points_surround_poses
+from cflow_torch.data.log import Log, LogWrapper, known_poses
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.transforms import relative_transform, rigid_transform
 from cflow_torch.types import Sweep
@@ -111,14 +110,11 @@ class PosedLog(LogWrapper):
         self.poses = self._given = poses
         self.trajectory = None
 
-    @cached_property
-    def surrounds_poses(self) -> bool:
-        return points_surround_poses(self)
-
     def sweep(self, index: int) -> Sweep:
         return replace(self.log.sweep(index), pose=self._given[index].copy())
 
 
 def with_poses(log: Log, refine: bool = False) -> Log:
-    """Return a log with `estimate_poses`, or the log itself if its first sweep has a pose that is not to be refined."""
-    return log if log.sweep(0).pose is not None and not refine else PosedLog(log, estimate_poses(log))
+    """Return a log with `estimate_poses`, or the log itself if its sweeps have poses that are not to be refined."""
+    has_poses = log.sweep(0).pose is not None and (log.poses is None or known_poses(log) is not None)
+    return log if has_poses and not refine else PosedLog(log, estimate_poses(log))

@@ -9,7 +9,7 @@ from typing import Any, Sequence
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, Finding
-from cflow_torch.data.log import FlowLabels, Log, LogWrapper, known_poses, points_surround_poses, poses_beyond
+from cflow_torch.data.log import FlowLabels, Log, LogWrapper, known_poses, poses_beyond
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.data.odometry import PosedLog
 from cflow_torch.diagnosis.conventions import LATEST, OF_POINTS, READINGS, REVERSED, TIMES_OF_POSES, WORLD
@@ -98,10 +98,6 @@ class ReadAs(LogWrapper):
     @property
     def readings(self) -> tuple[str, ...]:
         return (*self.log.readings, self.reading)
-
-    @cached_property
-    def surrounds_poses(self) -> bool:
-        return points_surround_poses(self)
 
     def sweep(self, index: int) -> Sweep:
         sweep = self.log.sweep(index)

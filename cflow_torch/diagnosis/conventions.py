@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import accumulate
 from typing import Callable, NamedTuple, Sequence
 
@@ -58,7 +59,11 @@ class Reading(NamedTuple):
 
 
 def scaled(unit: float) -> _Convert:
-    return lambda poses: as_matrix(poses[..., :3, :3], unit * poses[..., :3, 3])
+    return partial(_scale, unit)  # logs that keep it must be picklable
+
+
+def _scale(unit: float, poses: np.ndarray) -> np.ndarray:
+    return as_matrix(poses[..., :3, :3], unit * poses[..., :3, 3])
 
 
 def turned(axes: np.ndarray) -> _Convert:

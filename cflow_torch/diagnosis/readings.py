@@ -199,7 +199,7 @@ def make_pair(
     if in_world:
         transforms = {name: _about(centre, T) for name, T in transforms.items()}
         transforms[WORLD] = transforms.pop(STILL)
-    has_motion = has_poses and (in_world or difference(transforms[GIVEN], np.eye(4)) >= _LEAST_MOTION)
+    has_motion = has_poses and (in_world or bool(difference(transforms[GIVEN], np.eye(4)) >= _LEAST_MOTION))
     is_sparse = min(len(pc0.points), len(pc1.points)) < _SPARSE
     return Pair(clouds[0], clouds[1], transforms, tuple(scans), has_motion, is_sparse)
 
@@ -540,10 +540,11 @@ def is_around(points: Array, pose: np.ndarray) -> bool:
     return bool(near_pose < near_origin)
 
 
-def difference(T: np.ndarray, other: np.ndarray) -> float:
-    """Return about how far apart two rigid transforms move points 20 m away, metres."""
-    rotation = np.linalg.norm(T[:3, :3] - other[:3, :3]) / np.sqrt(2)
-    return float(np.linalg.norm(T[:3, 3] - other[:3, 3]) + _ARM * rotation)
+def difference(T: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return about how far apart rigid transforms, (..., 4, 4), move points 20 m away, (...) float64, metres."""
+    apart = T - other
+    rotation = np.linalg.norm(apart[..., :3, :3], axis=(-2, -1)) / np.sqrt(2)
+    return np.linalg.norm(apart[..., :3, 3], axis=-1) + _ARM * rotation  # type: ignore[no-any-return]
 
 
 def _num_blocks(points: np.ndarray) -> int:

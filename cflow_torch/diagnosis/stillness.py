@@ -54,6 +54,11 @@ def share_in_place(pc0: Sweep | None, points0: np.ndarray, pc1: Sweep | None, po
     return Structure(points1).share(points0[:_COMPARED], T)
 
 
+def share_of_sweeps(pc0: Sweep, pc1: Sweep) -> float:
+    """Return the share of the structure of a sweep that is in place in another one; NaN = too little of it."""
+    return share_in_place(pc0, structure_of(pc0), pc1, structure_of(pc1))
+
+
 def static_rows(points: np.ndarray, is_ground: Any = None) -> np.ndarray:
     """Return the rows of points that are finite, not ground, and 3 to 40 m from the origin, (K,) int64, ascending.
 

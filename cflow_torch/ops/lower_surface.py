@@ -19,7 +19,8 @@ def lower_surface(low: Tensor) -> Tensor:
     """Fit the highest surface of limited slope below the heights, apart from low outliers. Objects rise more steeply.
 
     Args:
-        low: (B, H, W) int32, mm, a low height of each cell, such as its tenth percentile; `NO_HEIGHT` = empty.
+        low: (B, H, W) int32, mm, a low height of each cell, such as its tenth percentile; `NO_HEIGHT` = empty. In the
+            middle of the map, the ground is at 0.
 
     Returns:
         (B, H, W) int32, mm, defined everywhere.
@@ -29,7 +30,7 @@ def lower_surface(low: Tensor) -> Tensor:
 
     Cost: about sixty passes over the maps.
     """
-    is_supported = _is_supported(low)
+    is_supported = _is_supported(low) & (low >= _lowest(low))
     hills = _box_mean(_gentlest(low.masked_fill(~is_supported, NO_HEIGHT), _STEEP))
     rest = low - hills
     # Far rings have many cells without similar neighbours. Such a cell counts unless it is far below the hills.
@@ -49,6 +50,17 @@ def _is_supported(low: Tensor) -> Tensor:
         num_occupied += neighbour < NO_HEIGHT
     is_similar = num_similar * 2 >= num_occupied.clamp(max=6)
     return is_similar & (num_occupied > 0) & (low < NO_HEIGHT)
+
+
+def _lowest(low: Tensor) -> Tensor:
+    """Return how low the ground may be in each cell, (H, W) int32, mm, if it falls from the middle like the hills.
+
+    Several points of a mirrored object support one another, and are often many metres below the ground.
+    """
+    height, width = low.shape[1:]
+    rows = (torch.arange(height, dtype=torch.int32, device=low.device) - height // 2).abs_()
+    cols = (torch.arange(width, dtype=torch.int32, device=low.device) - width // 2).abs_()
+    return (rows[:, None] + cols).mul_(-_STEEP).sub_(_SUPPORT)
 
 
 def _gentlest(heights: Tensor, slope: int) -> Tensor:

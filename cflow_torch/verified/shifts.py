@@ -39,12 +39,12 @@ class Shifts:
         displacement = motions[:, None] * elapsed[..., None, None]  # [2, M, S, C, 2]
         pair = (displacement + 0.5).floor().int().view(torch.int64)[..., 0]  # [2, M, S, C], y and x as one number
         num_motions = motions.shape[1]
+        self._number: Tensor | None = None  # motion c has shift c
         if num_motions > 1 and pair.device.type == "cpu":
             self.count, self._number, motion = _distinct(_first_equal(pair))
             pair = pair.gather(3, motion[:, None].expand_as(pair))
-        else:  # motion c has shift c; on a GPU, the launches would cost more than the comparisons
+        else:  # on a GPU, the launches would cost more than the comparisons
             self.count = torch.full_like(window, num_motions)
-            self._number = None
         self._shift = pair.flatten(0, 2)[..., None].view(torch.int32)  # [2 M S, C, 2]
         is_far = torch.maximum(*self._shift.abs().unbind(2)) >= _FAR  # [2 M S, C]
         is_far |= is_wide[:, None].expand(2, -1, sweeps.num_steps).reshape(-1, 1)

@@ -16,7 +16,7 @@ from tiny_recording import TinyRecording
 from cflow_torch import CFlowError
 from cflow_torch.data.bags import BagLog, find_bags
 from cflow_torch.data.bags.messages import cloud_columns, points_of
-from cflow_torch.data.catalog import recognise
+from cflow_torch.data.catalog import open_log, recognise
 from cflow_torch.types import CFlowWarning
 
 TF, CLOUD, ODOMETRY = "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry"
@@ -276,7 +276,7 @@ def test_a_gap_splits_windows(tmp_path) -> None:
     bag.drive()
     bag.clouds([0, 1, 2, 7])
     with pytest.warns(CFlowWarning, match="1 gaps between sweeps .*0.5 s long, after sweep 2"):
-        assert BagLog(bag.close()).gaps == {2}
+        assert open_log("bags", bag.close()).gaps == {2}
 
 
 def test_clouds_in_the_frame_of_the_world_are_moved_to_the_odometry(tmp_path) -> None:

@@ -18,6 +18,7 @@ from cflow_torch.data.arrays.cloud_file import write_cloud
 from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.deskewing import DeskewedLog
+from cflow_torch.data.finding import RIGHT
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper
 from cflow_torch.diagnosis.stillness import Structure, static_rows, thinned_rows
 from cflow_torch.simulator.drive import Drive
@@ -155,7 +156,7 @@ def test_times_that_are_all_equal_do_not_say_anything(raw: Drive, constant: floa
 def test_compensated_and_slow_sweeps_stay_as_they_are(case: str, truth: Drive) -> None:
     given = truth if case == "compensated" else make(speed=1.0, num_sweeps=4)
     log = DeskewedLog(Untimed(given))
-    assert log.scan == "off" and log.findings() == []
+    assert log.scan == "off" and [finding.status for finding in log.findings()] == [RIGHT]
     assert np.array_equal(log.sweep(1).points, given.sweep(1).points) and log.sweep(1).point_times is None
 
 
@@ -364,3 +365,40 @@ def test_slow_sweeps_with_times_are_compared_too() -> None:
     for is_deskewed in (False, True):
         log = DeskewedLog(InBag(make(speed=3.0, is_deskewed=is_deskewed)))
         assert log.scan == ("off" if is_deskewed else "times")
+
+
+def test_the_motion_over_a_gap_is_not_that_within_a_sweep(raw: Drive, truth: Drive) -> None:
+    late = Untimed(raw)
+    late.timestamps = [stamp + 20 * 10**9 * (k > 3) for k, stamp in enumerate(raw.timestamps)]
+    late.gaps = frozenset([3])
+    log = DeskewedLog(late, "clockwise")
+    assert max(largest_error(log, truth, index) for index in (2, 3, 4, 5)) < 0.05
+
+
+def test_a_direction_without_poses_is_said(raw: Drive) -> None:
+    class Unposed(Untimed):
+        poses = None
+
+        def sweep(self, index: int) -> Sweep:
+            return replace(super().sweep(index), pose=None)
+
+    log = DeskewedLog(Unposed(raw), "clockwise")
+    with pytest.warns(CFlowWarning, match="deskew=clockwise needs poses, and sweep 1 has none: try data.odometry=true"):
+        assert log.sweep(1) is not None
+
+
+def test_points_of_four_columns_and_of_nan_move_along_a_trajectory(raw: Drive) -> None:
+    class Four(Untimed):
+        trajectory = np.array(raw.timestamps), raw.poses
+
+        def sweep(self, index: int) -> Sweep:
+            sweep = super().sweep(index)
+            points = np.column_stack([sweep.points, np.zeros(len(sweep.points), np.float32)])
+            points[0] = np.nan
+            return replace(sweep, points=points)
+
+    three = DeskewedLog(Untimed(raw), "clockwise")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        moved = DeskewedLog(Four(raw), "clockwise").sweep(2).points
+    assert np.isnan(moved[0]).all() and np.abs(moved[1:] - three.sweep(2).points[1:]).max() < 0.02

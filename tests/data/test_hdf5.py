@@ -10,8 +10,9 @@ from hdf5_scene import STAMPS, move_to_sensor, write_scene
 from small_logs import make_small_drive
 
 from cflow_torch import CFlowError
+from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
-from cflow_torch.data.hdf5.writer import write_hdf5_scene
+from cflow_torch.data.hdf5.writer import labelled_by, write_hdf5_scene
 from cflow_torch.data.log import CachedLog, intervals_of, window
 from cflow_torch.transforms import to_quaternions, transform_points
 from cflow_torch.types import CFlowWarning
@@ -66,6 +67,43 @@ def test_a_scene_without_poses_uses_its_ego_motion(drive, tmp_path):
         with pytest.raises(CFlowError, match="has no pose.*Store pose.*ego_motion.*data.odometry=true"):
             log.sweep(0)
         assert unposed.sweep(1).pose is None
+
+
+def without_poses(drive, file, indices):
+    write_hdf5_scene(drive, file)
+    with h5py.File(file, "r+") as scene:
+        for index in indices:
+            del scene[sorted(scene)[index]]["pose"]
+    return file
+
+
+@pytest.mark.parametrize("indices", [[1], [1, 2]])
+def test_sweeps_without_a_pose_follow_from_the_ego_motion_of_those_before(drive, tmp_path, indices):
+    with HDF5Log(without_poses(drive, tmp_path / "a.h5", indices)) as log:
+        assert np.allclose(log.sweep(indices[-1]).pose, drive.poses[indices[-1]], atol=1e-5)
+        assert np.allclose(log.poses, drive.poses, atol=1e-5)
+
+
+def test_one_sweep_without_a_pose_does_not_lose_the_others(drive, tmp_path):
+    file = without_poses(drive, tmp_path / "a.h5", [0])
+    log = open_log("hdf5", file, check=False)
+    with pytest.raises(CFlowError, match="has no pose"):
+        log.sweep(0)
+    assert np.allclose(log.sweep(1).pose, drive.poses[1], atol=1e-6)
+    estimated = open_log("hdf5", file, check=False, odometry=True)
+    assert np.isfinite(estimated.sweep(0).pose).all()
+
+
+def test_a_gap_in_the_times_splits_windows(tmp_path):
+    write_hdf5_scene(make_small_drive(num_sweeps=6), tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as scene:
+        *_, before, last = sorted(scene)
+        scene.move(last, str(int(last) + 20 * 10**9))
+    with pytest.warns(CFlowWarning, match="1 gaps between sweeps .the first is 20 s long"):
+        log = open_log("hdf5", tmp_path / "a.h5", deskew="clockwise")
+    last = len(log) - 1
+    assert log.gaps == {last - 1} and window(log, last - 2, num_future=1).pcf == ()
+    assert log.labels(last - 2) is not None and log.labels(last - 1) is None and log.labels(last) is None
 
 
 def test_poses_may_be_the_upper_three_rows(drive, tmp_path):
@@ -244,7 +282,11 @@ def test_groups_may_be_numbered_or_called_by_seconds(tmp_path, name, stamps, has
     with h5py.File(file, "r+") as scene:
         for k, stamp in enumerate(STAMPS):
             scene.move(str(stamp), name.format(k))
-    log = HDF5Log(file)
-    assert list(log.timestamps) == stamps
-    assert all(map(np.array_equal, before, [sweep.points for sweep in log]))
-    assert log.sweep(1).timestamp_ns == (stamps[1] if has_times else None)
+    with HDF5Log(file) as log:
+        assert list(log.timestamps) == stamps
+        assert all(map(np.array_equal, before, [sweep.points for sweep in log]))
+        assert log.sweep(1).timestamp_ns == (stamps[1] if has_times else None)
+    assert labelled_by(file) is None
+    with h5py.File(file, "r+") as scene:
+        scene[name.format(1)]["dufo"] = np.zeros(50, np.uint8)
+    assert labelled_by(file) == "", "of an unknown method"

@@ -13,8 +13,9 @@ import pytest
 from torch.utils.data import DataLoader
 
 from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
-from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow, write_flow
+from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, has_track_ids, read_flow, write_flow
 from cflow_torch.data.log import CachedLog, FlowLabels, Log, WindowDataset, window, windows
+from cflow_torch.errors import MissingFile
 from cflow_torch.simulator import Drive, make_drive
 from cflow_torch.types import Sweep
 
@@ -202,3 +203,18 @@ def test_objects_are_the_moving_objects_of_the_simulator(drive, result):
     empty = result.objects(drive.sweep(3).points, min_speed=1e3)
     assert empty.to_records() == []
     assert len(empty) == 0 and empty.dtype == objects.dtype
+
+
+def test_a_stopped_cache_stays_stopped_in_another_process(drive):
+    log = CachedLog(drive, 3)
+    log.stop()
+    for stopped in (log, pickle.loads(pickle.dumps(log))):
+        assert stopped.sweep(1) is not stopped.sweep(1)
+
+
+def test_a_damaged_flow_file_is_named(tmp_path):
+    (tmp_path / "1.feather").write_bytes(b"no arrow file")
+    with pytest.raises(CFlowError, match="1.feather"):
+        has_track_ids(tmp_path / "1.feather")
+    with pytest.raises(MissingFile, match="2.feather is missing"):
+        read_flow(tmp_path / "2.feather")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 import warnings
 from dataclasses import replace
@@ -15,6 +16,7 @@ from cflow_torch import CFlowError, Sweep
 from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import open_log
+from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.log import CachedLog, Log, LogWrapper, poses_beyond
 from cflow_torch.data.log_check import FOUND, RIGHT, WRONG, check_log, examine, find_problems
 from cflow_torch.data.log_motion import JUMP, POSE, find_lapses, judge_log
@@ -493,8 +495,11 @@ def jumping(poses):
 def test_jumps_of_the_poses_do_not_hide_other_mistakes(drive):
     (problem,) = find_problems(Wrong(drive, poses=jumping))
     assert "jump" in problem and "before sweep 4" in problem and "before sweep 8" in problem
-    problems = find_problems(Wrong(drive, poses=lambda poses: np.linalg.inv(jumping(poses))))
-    assert any("data.read_as=inverted" in text for text in problems) and any("jump" in text for text in problems)
+    both = Wrong(drive, poses=lambda poses: np.linalg.inv(jumping(poses)))
+    (problem,) = find_problems(both)
+    assert "data.read_as=inverted" in problem
+    (problem,) = find_problems(read_as(both, "inverted"))
+    assert "jump" in problem
 
 
 @pytest.mark.slow
@@ -736,7 +741,18 @@ def test_points_in_the_world_without_poses_are_told_by_the_last_sweep(drive):
 def test_masks_and_repeated_sweeps_are_recognised(drive):
     assert "invert the mask" in find_problems(Wrong(drive, masks=np.logical_not))[0]
     repeated = Wrong(drive, order=[0, 0, *range(2, 12)])
-    assert any("the same points" in text for text in find_problems(repeated))
+    assert any("sweep 1 repeats the points" in text for text in find_problems(repeated))
+
+
+@pytest.mark.parametrize("source", ["drive", "real"])
+def test_ground_masks_of_other_rows_and_of_all_points_are_recognised(request, source):
+    log = request.getfixturevalue(source)
+    shuffled = Wrong(log, masks=np.random.default_rng(0).permutation)
+    shifted = Wrong(log, masks=lambda mask: np.roll(mask, len(mask) // 7))
+    for wrong in (shuffled, shifted):
+        assert any("has it the rows of this sweep" in text for text in find_problems(wrong))
+    assert any("no point would have flow" in text for text in find_problems(Wrong(log, masks=np.ones_like)))
+    assert not any("ground" in text for text in find_problems(Wrong(log, masks=np.zeros_like)))
 
 
 def test_opening_a_log_warns_of_likely_mistakes(drive):
@@ -762,7 +778,7 @@ def test_the_page_says_what_was_found(drive):
     late = Wrong(drive)
     late.timestamps = [*drive.timestamps[:6], *(stamp + 700_000_000 for stamp in drive.timestamps[6:])]
     times = next(one for one in examine(late) if one.topic == "times")
-    assert times.status == WRONG and "0.8 s after sweep 5" in times.text
+    assert times.status == FOUND and "0.8 s after sweep 5" in times.text
 
 
 def test_the_page_counts_sweeps_that_cannot_be_read(drive):
@@ -895,12 +911,10 @@ def test_sweeps_of_few_points_do_not_blame_the_poses(drive):
     assert find_problems(Sparse(drive)) == []
 
 
-def test_the_page_lists_notes_of_the_reader_and_knows_its_gaps(drive):
+def test_the_page_lists_notes_of_the_reader_and_its_gaps(drive):
     log = Wrong(drive)
     log.timestamps = [time + 3 * 10**9 * (index > 5) for index, time in enumerate(drive.timestamps)]
-    page = {finding.topic: finding for finding in examine(log)}
-    assert page["times"].status == WRONG and "reader" not in page
-    log.gaps = frozenset([5])
+    assert "reader" not in {finding.topic for finding in examine(log)}
     with pytest.warns(CFlowWarning, match="it has a gap"):
         log._note("it has a gap")
     page = {finding.topic: finding for finding in examine(log)}
@@ -978,3 +992,11 @@ def test_the_command_prints_a_page_or_json(drive, tmp_path, capsys):
     assert log["log"] == "bad" and {row["status"] for row in log["findings"]} == {RIGHT, WRONG}
     assert cflow("check", tmp_path / "bad", "data.read_as=inverted") == 0
     assert FOUND not in capsys.readouterr().out
+
+
+def test_a_checked_log_is_picklable(drive, tmp_path):
+    """Its cached judgement may hold a scale of the poses."""
+    scaled_drive = Wrong(drive, poses=scaled(1.5))
+    log = DeskewedLog(scaled_drive)
+    assert "times as long as the motion of the points" in str(log.judgement)
+    assert pickle.loads(pickle.dumps(log.judgement)).best == log.judgement.best

@@ -18,6 +18,7 @@ from cflow_torch.data.arrays.cloud_file import write_cloud
 from cflow_torch.data.arrays.folder import find_array_logs
 from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.arrays.stamps import nanoseconds_of_dates, nanoseconds_of_numbers, times_of_names
+from cflow_torch.data.catalog import open_log
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
@@ -827,5 +828,5 @@ def test_clouds_of_a_second_sensor_are_said(tmp_path) -> None:
 def test_a_gap_in_the_times_splits_a_folder(tmp_path) -> None:
     late = [stamp + 2 * 10**9 * (k > 5) for k, stamp in enumerate(STAMPS)]
     with pytest.warns(CFlowWarning, match="it has 1 gaps between sweeps .the first is 2.1 s long, after sweep 5"):
-        log = ArraysLog(clouds(tmp_path, late))
+        log = open_log("arrays", clouds(tmp_path, late))
     assert log.gaps == {5} and len(window(log, 7, num_history=4).pch) == 1

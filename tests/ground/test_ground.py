@@ -136,6 +136,14 @@ def test_multipath_points_below_the_ground_do_not_pull_it_down(sweeps):
     assert overlap(find_ground(rain)[keep], find_ground(sweeps[0].points)[keep]) > 0.98
 
 
+def test_the_mirror_image_of_an_object_far_below_does_not_pull_the_ground_down(sweeps):
+    points = sweeps[0].points
+    for x, y, depth in ((-40, 1, 14), (30, 25, 30)):
+        mirrored = block((x, y, -depth), (x + 0.5, y + 3, 0.5 - depth), 20, 6)
+        mask = find_ground(np.concatenate([points, mirrored]))
+        assert np.array_equal(mask[: len(points)], find_ground(points)), (x, y, depth)
+
+
 def test_a_simulated_drive_on_flat_ground_and_on_hills():
     drive = make_drive(seed=SEED, num_sweeps=1, profile="av2")
     sweep = drive.sweep(0)

@@ -135,8 +135,9 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
         )
     numbers = words.astype(np.float64)
     rotation = [column for role, column in roles.items() if role in _ROTATIONS]
-    is_known = np.isfinite(numbers[:, list(roles.values())]).all(axis=1)
-    is_known &= not rotation or (numbers[:, rotation] != 0).any(axis=1)  # programs write zeros for lost poses
+    is_known: np.ndarray = np.isfinite(numbers[:, list(roles.values())]).all(axis=1)
+    if rotation:  # programs write zeros for lost poses
+        is_known &= (numbers[:, rotation] != 0).any(axis=1)
     if not is_known.any():
         raise CFlowError(f"{path} has no pose of finite numbers and a rotation that is not 0")
     if not _TIMES.isdisjoint(roles):  # programs write a line twice; without times, lines repeat if the vehicle stands

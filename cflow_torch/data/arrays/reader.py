@@ -119,8 +119,6 @@ class ArraysLog(Log):
         if trajectory is not None and (are_of_lidar or poses_of == "lidar"):
             trajectory = trajectory._replace(poses=trajectory.poses @ np.linalg.inv(self.ego_T_lidar))
         self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
-        if trajectory is None and self._has_times:
-            self.gaps = self._with_gaps_in_time()
         self.gaps |= frozenset(self._gaps_in_numbers())
         self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAYS))
         if trajectory is not None and self.has_viewpoints:
@@ -305,8 +303,7 @@ class ArraysLog(Log):
         kept = np.flatnonzero(is_known)
         self.files, self.timestamps = [self.files[k] for k in kept], [self.timestamps[k] for k in kept]
         self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
-        gaps = np.flatnonzero(np.diff(kept) > 1).tolist()
-        self.gaps = self._with_gaps_in_time(gaps) if self._has_times else frozenset(gaps)
+        self.gaps = frozenset(np.flatnonzero(np.diff(kept) > 1).tolist())
         return poses
 
     def _gaps_in_numbers(self) -> list[int]:

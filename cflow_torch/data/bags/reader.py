@@ -131,7 +131,6 @@ class BagLog(Log):
             if trajectory is not None:
                 self._use_poses(trajectory)
             self._check_count(f"{self.path}: {self.topic}, while there are poses,")
-            self.gaps = self._with_gaps_in_time()
             self._period = float(np.median(np.diff(self.timestamps))) * 1e-9
             self.lidar_position = self._mount_at(self.timestamps[0])[:3, 3]
 

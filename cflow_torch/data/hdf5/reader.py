@@ -67,7 +67,7 @@ class HDF5Log(Log):
 
     def __init__(self, file: PathLike, ego_T_lidar: Any = "auto", needs_poses: bool = True) -> None:
         self.file, self._needs_poses = as_path(file), needs_poses
-        self._chain = [np.eye(4)]  # poses from `ego_motion`, as far as they are known
+        self._chain: list[Any] = []  # poses of the first sweeps, from `ego_motion` where they have none; None = unknown
         self.log_id = self.file.stem
         self._scene = open_scene(self.file)
         # HDF5 would close the file after the interpreter has ended, which crashes if it is a Python file object.
@@ -95,6 +95,11 @@ class HDF5Log(Log):
         points = self._values(index, "lidar", None, np.float32)
         is_ground = self._values(index, "ground_mask", rows, np.bool_)
         pose = self._stored_pose(index)
+        if pose is None and self._needs_poses:
+            raise CFlowError(
+                f"{self.file}: sweep {self.sweep_name(index)} has no pose; it has {', '.join(self.keys(index))}. Store "
+                "pose (T_world_ego) of every sweep, or ego_motion to the next sweep, or set data.odometry=true"
+            )
         if pose is not None and not np.array_equal(self.ego_T_lidar, np.eye(4)):
             pose = rigid_transform(pose, f"pose of sweep {self.sweep_name(index)} in {self.file}") @ self.ego_T_lidar
         time = None if self.timestamps[-1] < _FIRST_MICROSECOND else timestamp  # None: the groups are numbered
@@ -114,8 +119,7 @@ class HDF5Log(Log):
         points[found.is_stray] = np.nan
         return np.where(found.is_stray, 0, found.seconds)
 
-    def labels(self, index: int) -> FlowLabels | None:
-        """Read the truth of the pair (index, index + 1); None if the sweep has no `flow`."""
+    def _labels(self, index: int) -> FlowLabels | None:
         rows = self._rows(index)
         flow = self._values(index, "flow", (*rows, 3), np.float32)
         if flow is None:
@@ -164,9 +168,12 @@ class HDF5Log(Log):
         return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
 
     @cached_property
-    def poses(self) -> np.ndarray:
-        """(K, 4, 4) float64 `T_world_lidar` of every sweep, without reading any points."""
-        stored = np.stack([self._stored_pose(index) for index in range(len(self))])
+    def poses(self) -> np.ndarray | None:
+        """(K, 4, 4) float64 `T_world_lidar` of every sweep, without reading any points; NaN or None = unknown."""
+        of_sweeps = [self._stored_pose(index) for index in range(len(self))]
+        if all(pose is None for pose in of_sweeps):
+            return None
+        stored = np.stack([np.full((4, 4), np.nan) if pose is None else pose for pose in of_sweeps])
         with np.errstate(all="ignore"):  # NaN stays NaN
             return stored @ self.ego_T_lidar
 
@@ -182,24 +189,26 @@ class HDF5Log(Log):
         return matrix if is_square else self._values(index, key, (4, 4), dtype)  # raises the error
 
     def _stored_pose(self, index: int, dtype: Any = np.float64) -> Any:
-        """Read a pose, or compute it from earlier ego motions. Without any, return None unless poses are needed."""
+        """Read a pose, or compute it from the pose before and the ego motion; None = it is unknown."""
         pose = self._matrix(index, "pose", dtype)
-        if pose is not None:
-            return pose
-        while len(self._chain) <= max(index, 1):
-            motion = self._matrix(len(self._chain) - 1, "ego_motion", np.float64)
-            if motion is None:
-                break
-            name = f"ego_motion of sweep {self.sweep_name(len(self._chain) - 1)} in {self.file}"
-            self._chain.append(self._chain[-1] @ np.linalg.inv(rigid_transform(motion, name)))
-        if index < len(self._chain) > 1:
-            return self._chain[index]
-        if not self._needs_poses:
+        while pose is None and len(self._chain) <= index:
+            self._chain.append(self._next_in_chain())
+        return self._chain[index] if pose is None else pose
+
+    def _next_in_chain(self) -> np.ndarray | None:
+        """Return the pose of the sweep after those of the chain; without poses, the world is the first ego frame."""
+        index = len(self._chain)
+        stored = self._matrix(index, "pose", np.float64)
+        if stored is not None:
+            return stored
+        if index == 0:
+            has_motions = self._matrix(0, "ego_motion", np.float64) is not None
+            return np.eye(4) if has_motions and self._matrix(1, "pose", np.float64) is None else None
+        motion = self._matrix(index - 1, "ego_motion", np.float64)
+        if motion is None or self._chain[-1] is None:
             return None
-        raise CFlowError(
-            f"{self.file}: sweep {self.sweep_name(index)} has no pose; it has {', '.join(self.keys(index))}. Store "
-            "pose (T_world_ego) of every sweep, or ego_motion to the next sweep, or set data.odometry=true"
-        )
+        motion = rigid_transform(motion, f"ego_motion of sweep {self.sweep_name(index - 1)} in {self.file}")
+        return self._chain[-1] @ np.linalg.inv(motion)  # type: ignore[no-any-return]
 
     def _stated_extrinsics(self) -> np.ndarray:
         """Return the extrinsics of the scene's attribute, otherwise the recognised ones."""

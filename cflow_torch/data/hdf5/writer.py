@@ -25,7 +25,6 @@ from cflow_torch.data.hdf5.reader import (
     sweep_names,
 )
 from cflow_torch.data.log import Log
-from cflow_torch.data.paths import is_timestamp
 from cflow_torch.types import Array, CFlowError, as_numpy, check_array
 
 LABELS = ("dufo", "cluster", "dufocluster", "nnd")  # keys of labels for self-supervised training
@@ -147,7 +146,7 @@ def write_hdf5_labels(
 def labelled_by(file: str | Path) -> str | None:
     """Return how the labels of a scene were made (`made_by`); "" = unknown, None = the scene has no labels."""
     with open_scene(Path(file)) as scene, file_errors(file):
-        has_labels = any(set(scene[stamp]) & set(LABELS) for stamp in scene if is_timestamp(stamp))
+        has_labels = any(set(scene[name]) & set(LABELS) for name in sweep_names(scene).values())
         made_by = scene.attrs.get(LABELLED, "" if has_labels else None)
         return None if made_by is None else str(made_by)
 
