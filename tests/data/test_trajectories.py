@@ -351,6 +351,16 @@ def test_lines_with_times_may_have_any_order(tmp_path) -> None:
     assert read.times_ns.tolist() == STAMPS and np.allclose(read.poses[:, 0, 3], range(COUNT))
 
 
+def test_matrices_by_columns_may_begin_at_the_origin(tmp_path) -> None:
+    poses = POSES.copy()
+    poses[:, :3, 3] -= poses[2, :3, 3]
+    by_columns = poses.transpose(0, 2, 1)
+    (tmp_path / "poses.json").write_text(json.dumps(by_columns.tolist()))
+    assert np.allclose(poses_text.read_poses(tmp_path / "poses.json").poses, poses)
+    (tmp_path / "poses.txt").write_text("\n".join(rows(by_columns.reshape(12, 16))))
+    assert np.allclose(poses_text.read_poses(tmp_path / "poses.txt").poses, poses)
+
+
 def test_four_numbers_are_a_matrix_only_if_every_fourth_line_ends_it(tmp_path) -> None:
     (tmp_path / "poses.txt").write_text("\n".join(f"{k} {k} 0 0.1" for k in range(12)))
     with pytest.raises(CFlowError, match="4 numbers per line"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from decimal import Decimal
 from pathlib import Path
-from typing import Mapping, Sequence
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 
@@ -31,8 +31,8 @@ _QUATERNION = ("qw", "qx", "qy", "qz")
 _ROTATIONS = {*MATRIX[0:3], *MATRIX[4:7], *MATRIX[8:11], *_QUATERNION, "q0", "q1", "q2", "q3"}  # not all are zero
 _TIMES = {"time", "sec", "nsec"}
 _TUM = ("time", *_POSITION, "qx", "qy", "qz", "qw")
-# What columns without names hold, by their number; the last row of a matrix is ignored.
-_UNNAMED = {7: _TUM[1:], 8: _TUM, 12: MATRIX, 13: ("time", *MATRIX), 16: MATRIX, 17: ("time", *MATRIX)}
+_UNNAMED = {7: _TUM[1:], 8: _TUM, 12: MATRIX[:12], 13: ("time", *MATRIX[:12]), 16: MATRIX, 17: ("time", *MATRIX)}
+"""What columns without names hold, by their number."""
 _UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four are not a quaternion; 6 have no time
 STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz", ".npy")
 """Suffixes of files that must be whole to be read, see `tables_of_values`."""
@@ -124,8 +124,6 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
         unnamed = _UNNAMED_ANGLES[7 - words.shape[1] :]
     if words.shape[1] == 3 and not names and _end_in_headings(words):
         unnamed = ("x", "y", "yaw")
-    if words.shape[1] in (16, 17) and not names:
-        words = _by_rows(words)
     if not roles and (not names or len(unnamed) > 8 or len(names) == len(_TUM)):
         roles = {role: column for column, role in enumerate(unnamed)}
     if not roles:
@@ -135,7 +133,7 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
         )
     numbers = words.astype(np.float64)
     rotation = [column for role, column in roles.items() if role in _ROTATIONS]
-    is_known: np.ndarray = np.isfinite(numbers[:, list(roles.values())]).all(axis=1)
+    is_known: Any = np.isfinite(numbers[:, list(roles.values())]).all(axis=1)
     if rotation:  # programs write zeros for lost poses
         is_known &= (numbers[:, rotation] != 0).any(axis=1)
     if not is_known.any():
@@ -178,15 +176,6 @@ def _end_in_headings(words: np.ndarray) -> bool:
     return len(moved) > 0 and bool(np.median(ahead) > 0.9)
 
 
-def _by_rows(words: np.ndarray) -> np.ndarray:
-    """Return rows that end in matrices, (K, 16) or (K, 17), by rows, also if they are by columns."""
-    matrices = words[:, -16:].reshape(-1, 4, 4)
-    numbers = matrices.astype(np.float64)
-    if (numbers[:, :3, 3] != 0).any() or not (numbers[:, 3, :3] != 0).any():
-        return words
-    return np.concatenate([words[:, :-16], matrices.transpose(0, 2, 1).reshape(-1, 16)], axis=1)
-
-
 def _roles(names: Sequence[str]) -> dict[str, int]:
     """Return the columns of the position, rotation and time that names tell; {} = they do not tell a pose."""
     first: dict[str, int] = {}
@@ -209,7 +198,10 @@ def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.
     values = {role: words[:, column].astype(np.float64) for role, column in roles.items() if role not in _TIMES}
     zeros = np.zeros(len(words))
     if MATRIX[0] in roles:
-        poses = checked_poses(np.stack([values[name] for name in MATRIX], axis=1).reshape(-1, 3, 4), str(path))
+        matrices = np.stack([values[name] for name in MATRIX if name in values], axis=1).reshape(len(words), -1, 4)
+        if matrices.shape[1] == 4 and not matrices[:, :3, 3].any() and matrices[:, 3, :3].any():
+            matrices = matrices.transpose(0, 2, 1)  # by columns
+        poses = checked_poses(matrices[:, :3], str(path))
         is_inverse = bool(names) and any(each in names[roles[MATRIX[0]]].lower() for each in _INVERSE)
         return np.linalg.inv(poses) if is_inverse else poses
     if "x" not in values:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from datetime import datetime, timezone
 from decimal import Decimal
-from typing import Sequence
+from typing import Any, Sequence
 
 _UNITS = (1, 10**3, 10**6, 10**9)  # nanoseconds in ns, us, ms and s
 _SHORTEST, _LONGEST = 5 * 10**6, 10**11  # nanoseconds from one time to the next; of unix times, only the longest counts
@@ -29,13 +29,18 @@ def nanoseconds_of_numbers(words: Sequence[str]) -> list[int]:
     100 s. Times from another start have the smallest unit in which the step is at least 5 ms.
     """
     numbers = [Decimal(word) for word in words]
-    distinct = sorted(set(numbers))
-    steps = sorted(after - before for before, after in zip(distinct, distinct[1:])) or [Decimal(0)]
-    step = steps[len(steps) // 2]
-    units = [unit for unit in _UNITS if int(distinct[-1] * unit) in _UNIX and step * unit <= _LONGEST]
+    step = _usual_step(numbers)
+    units = [unit for unit in _UNITS if int(max(numbers) * unit) in _UNIX and step * unit <= _LONGEST]
     units += [unit for unit in _UNITS if step * unit >= _SHORTEST]
     unit = next(iter(units), 10**9)
     return [int((number * unit).to_integral_value()) for number in numbers]
+
+
+def _usual_step(numbers: Sequence[Any]) -> Any:
+    """Return the median step from one number to the next larger one."""
+    distinct = sorted(set(numbers))
+    steps = sorted(after - before for before, after in zip(distinct, distinct[1:])) or [Decimal(0)]
+    return steps[len(steps) // 2]
 
 
 def nanoseconds_of_dates(texts: Sequence[str]) -> list[int] | None:
@@ -87,9 +92,8 @@ def times_of_names(names: Sequence[str]) -> list[int] | None:
 def _without_counters(names: Sequence[str]) -> Sequence[str]:
     """Cut off the last number if it has three digits or more in all names, and mostly grows by less than ten."""
     last = [match for match in (re.search(r"(\d{3,})\D*$", name) for name in names) if match]
-    numbers = sorted(int(match[1]) for match in last)
-    steps = sorted(after - before for before, after in zip(numbers, numbers[1:]))
-    is_counter = len(last) == len(names) > 1 == len({len(match[1]) for match in last}) and steps[len(steps) // 2] < 10
+    is_counter = len(last) == len(names) > 1 == len({len(match[1]) for match in last})
+    is_counter = is_counter and _usual_step([int(match[1]) for match in last]) < 10
     return [name[: match.start()] for name, match in zip(names, last)] if is_counter else names
 
 

@@ -22,8 +22,8 @@ from cflow_torch.data.paths import read_bytes, suffix_of
 _FEWEST_NUMBERS = 7  # of a pose
 COMMENTS = ("#", "%", "//")
 """Beginnings of lines that are no rows."""
-MATRIX = tuple(f"m{k}" for k in range(12))
-"""Names of the entries of the upper three rows of a matrix, row by row."""
+MATRIX = tuple(f"m{k}" for k in range(16))
+"""Names of the entries of a matrix, row by row or column by column; the last four may be missing."""
 _VECTORS = {  # numbers in a list of a JSON file, and a role that the name of the list has -> endings of their names
     (3, "x"): (".x", ".y", ".z"),
     (4, "qx"): (".0", ".1", ".2", ".3"),
@@ -120,8 +120,8 @@ def _poses_only(lines: list[str]) -> list[str]:
 def tables_of_values(content: bytes, path: Path) -> Iterator[Table]:
     """Yield what may be a table in a JSON, YAML or .npz file: lists, and objects whose members are alike, outer first.
 
-    Numbers of a row are named by their keys, joined by dots. A list, nested or not, of 12 or 16 numbers is a matrix, by
-    rows, or by columns if these end in 0, 0, 0, 1. A list of three or four is a vector if the name of the list says so.
+    Numbers of a row are named by their keys, joined by dots. A list, nested or not, of 12 or 16 numbers is a matrix. A
+    list of three or four is a vector if the name of the list says so.
     """
     value = _value_of(content, path)
     for labels, members in (*_series(value), ([], [value])):
@@ -200,12 +200,8 @@ def _numbers_of(value: Any, name: str) -> Iterator[tuple[str, str]]:
     if isinstance(value, Decimal):
         yield name, str(value)
     elif len(numbers) in (12, 16):
-        matrix = np.array(numbers).reshape(-1, 4)
-        is_by_columns = len(matrix) == 4 and matrix[:, 3].tolist() == [0, 0, 0, 1] != matrix[3].tolist()
         prefix = f"{name}." if name else ""
-        yield from zip(
-            [prefix + each for each in MATRIX], map(str, (matrix.T if is_by_columns else matrix)[:3].ravel())
-        )
+        yield from ((prefix + entry, str(number)) for entry, number in zip(MATRIX, numbers))
     elif numbers:
         fitting = [
             ends
