@@ -62,7 +62,8 @@ DATA_SETS: dict[str, DataSet] = {
     "kiss_icp": DataSet("KissICPLog", "data for a loader of KISS-ICP"),
     "arrays": DataSet("ArraysLog", "folder of point clouds", (), "find_array_logs"),  # tried if no mark is found
 }
-_NAMED_BY_PATH = ("arrays", "bags", "pandaset")  # logs that have the names of their files or folders
+_NAMED_BY_PATH = ("arrays", "bags", "kitti", "pandaset")  # logs that have the names of their files or folders
+_OF_LAYOUTS = ("dataset", "sequences", "velodyne")  # folders whose names tell no log from another
 _DEEPEST = 6  # levels below the root that are searched for a mark
 
 
@@ -74,13 +75,13 @@ class UserSource(NamedTuple):
 
 
 class RenamedSource(NamedTuple):
-    """A file or folder of a log whose name others have, too."""
+    """A source of a log whose name others have, too."""
 
-    path: Path
+    source: Any
     name: str
 
     def __str__(self) -> str:
-        return str(self.path)
+        return str(self.source)
 
 
 def recognise(root: Any) -> str:
@@ -143,10 +144,12 @@ def find_all_sources(name: str, paths: Sequence[Any]) -> list[Any]:
     return _with_distinct_names(list(found.values())) if name in _NAMED_BY_PATH else list(found.values())
 
 
-def _with_distinct_names(sources: Sequence[Path]) -> list[Any]:
+def _with_distinct_names(sources: Sequence[Any]) -> list[Any]:
     """Rename logs of equal names, as results of both would be in one folder."""
-    names = [source.name if source.is_dir() else source.stem for source in sources]
-    distinct = distinct_names(names, [source.absolute().parts[1:-1][::-1] for source in sources])
+    places = [getattr(source, "folder", source) for source in sources]
+    names = [place.name if place.is_dir() else place.stem for place in places]
+    above = [[part for part in place.absolute().parts[-2:0:-1] if part not in _OF_LAYOUTS] for place in places]
+    distinct = distinct_names(names, above)
     renamed = zip(sources, names, distinct)
     return [source if name == other else RenamedSource(source, other) for source, name, other in renamed]
 
@@ -297,7 +300,7 @@ def open_log(
     if odometry and name == "hdf5":
         settings = {"needs_poses": False, **settings}
     new_name = source.name if isinstance(source, RenamedSource) else ""
-    source = source.path if isinstance(source, RenamedSource) else source
+    source = source.source if isinstance(source, RenamedSource) else source
     if isinstance(source, UserSource):
         log = _user_logs(name, settings)[source.number]
     else:

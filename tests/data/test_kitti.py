@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from test_bin_layout import street
 
-from cflow_torch.data.catalog import find_sources, open_log, recognise
+from cflow_torch.data.catalog import Logs, find_all_sources, find_sources, open_log, recognise, source_name
 from cflow_torch.data.kitti import KITTILog, find_kitti_drives
 from cflow_torch.transforms import rotations_about
 from cflow_torch.types import CFlowError, CFlowWarning
@@ -364,8 +364,10 @@ def test_drives_of_one_folder_have_distinct_names_nested_or_not(tmp_path: Path) 
         write_raw(tmp_path / "raw" / name)
     for data_set in ("a", "b"):
         write_sequence(tmp_path / data_set / "sequences" / "00")
-    names = [drive.name for drive in find_kitti_drives(tmp_path)]
-    assert sorted(names) == ["2011_09_26_drive_0001_sync", "2011_09_28_drive_0001_sync", "a-00", "b-00", "drive_9_sync"]
+    expected = ["2011_09_26_drive_0001_sync", "2011_09_28_drive_0001_sync", "a-00", "b-00", "drive_9_sync"]
+    for paths in ([tmp_path], [tmp_path / "raw", tmp_path / "a", tmp_path / "b"]):
+        logs = Logs("kitti", find_all_sources("kitti", paths), {"check": False, "deskew": "off", "find_ground": None})
+        assert sorted(map(source_name, logs.sources)) == expected == sorted(log.log_id for log in logs)
 
 
 def test_a_folder_velodyne_of_other_clouds_is_a_folder_of_clouds(tmp_path: Path) -> None:
