@@ -181,6 +181,11 @@ def test_numbers_that_count_the_files_are_no_times(start: str) -> None:
     assert times_of_names(names) == [1_700_000_000_000_000_000 + 50_000_000 * k for k in range(18)]
 
 
+def test_the_fractions_of_regular_times_are_no_counter() -> None:
+    stamps = [1_700_000_000_000_000_000 + k * 100_000_000 + 1000 * (k * 7 % 11) for k in range(600)]
+    assert times_of_names([f"{stamp // 10**9}.{stamp % 10**9 // 1000:06d}" for stamp in stamps]) == stamps
+
+
 def test_dates_may_have_a_time_zone() -> None:
     noon, utc = "2023-11-14T22:13:20", 1_700_000_000_000_000_000
     zones = {"": 0, "Z": 0, "+08:00": -8, "-0330": 3.5, ".25+01:00": -1, "_25": 0}
@@ -635,9 +640,11 @@ def test_times_from_another_start_have_the_unit_of_their_steps(tmp_path) -> None
     [
         (150 * 10**9, 10**8, 1),  # since boot
         (1_700_000_000, 10**8, 1),  # since boot, of the size of unix seconds
+        (150 * 10**9, 2_500_000, 1),  # 400 poses a second
         (3 * 86_400 * 10**6, 10**5, 10**3),
         (300_000 * 10**6, 10**5, 10**3),  # of the GPS week
         (1_700_000_000, 1, 10**9),
+        (5, 1, 10**9),
     ],
 )
 def test_times_of_any_size_have_the_unit_of_their_steps(first: int, step: int, unit: int) -> None:

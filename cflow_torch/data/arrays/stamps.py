@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 from datetime import datetime, timezone
 from decimal import Decimal
-from typing import Any, Sequence
+from typing import Sequence
 
 _UNITS = (1, 10**3, 10**6, 10**9)  # nanoseconds in ns, us, ms and s
-_SHORTEST, _LONGEST = 5 * 10**6, 10**11  # nanoseconds from one time to the next; of unix times, only the longest counts
+_SHORTEST, _LONGEST = (
+    12 * 10**5,
+    10**11,
+)  # nanoseconds from one time to the next; of unix times, only the longest counts
 _UNIX = range(10**18, 41 * 10**17)  # nanoseconds since 1970: from 2001 to 2099
 # After colons, "-08:00" and "-0800" are a time zone, else "-123456" is a fraction.
 _DATE = re.compile(
@@ -26,21 +29,16 @@ def nanoseconds_of_numbers(words: Sequence[str]) -> list[int]:
     """Convert texts of times to nanoseconds exactly: unix times need 19 digits, a float has 16.
 
     They may be in s, ms, us or ns. The unit is the one in which they are unix times with a median step of at most
-    100 s. Times from another start have the smallest unit in which the step is at least 5 ms.
+    100 s. Times from another start have the smallest unit in which the step is at least 1.2 ms.
     """
     numbers = [Decimal(word) for word in words]
-    step = _usual_step(numbers)
-    units = [unit for unit in _UNITS if int(max(numbers) * unit) in _UNIX and step * unit <= _LONGEST]
+    distinct = sorted(set(numbers))
+    steps = sorted(after - before for before, after in zip(distinct, distinct[1:])) or [Decimal(0)]
+    step = steps[len(steps) // 2]
+    units = [unit for unit in _UNITS if int(distinct[-1] * unit) in _UNIX and step * unit <= _LONGEST]
     units += [unit for unit in _UNITS if step * unit >= _SHORTEST]
     unit = next(iter(units), 10**9)
     return [int((number * unit).to_integral_value()) for number in numbers]
-
-
-def _usual_step(numbers: Sequence[Any]) -> Any:
-    """Return the median step from one number to the next larger one."""
-    distinct = sorted(set(numbers))
-    steps = sorted(after - before for before, after in zip(distinct, distinct[1:])) or [Decimal(0)]
-    return steps[len(steps) // 2]
 
 
 def nanoseconds_of_dates(texts: Sequence[str]) -> list[int] | None:
@@ -90,10 +88,12 @@ def times_of_names(names: Sequence[str]) -> list[int] | None:
 
 
 def _without_counters(names: Sequence[str]) -> Sequence[str]:
-    """Cut off the last number if it has three digits or more in all names, and mostly grows by less than ten."""
+    """Cut off the last number if it has three digits or more in all names, and always grows, usually by less than 10."""
     last = [match for match in (re.search(r"(\d{3,})\D*$", name) for name in names) if match]
-    is_counter = len(last) == len(names) > 1 == len({len(match[1]) for match in last})
-    is_counter = is_counter and _usual_step([int(match[1]) for match in last]) < 10
+    numbers = [int(match[1]) for match in last]
+    steps = sorted(after - before for before, after in zip(numbers, numbers[1:]))
+    are_alike = len(last) == len(names) > 1 == len({len(match[1]) for match in last})
+    is_counter = are_alike and steps[0] > 0 and steps[len(steps) // 2] < 10
     return [name[: match.start()] for name, match in zip(names, last)] if is_counter else names
 
 
