@@ -7,6 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, Callable, Sequence, TypeVar
 
+from cflow_torch.data.paths import is_remote
 from cflow_torch.errors import CFlowError
 
 _T = TypeVar("_T")
@@ -47,6 +48,8 @@ def visible(folder: Path) -> list[Path]:
     try:
         return [path for path in folder.iterdir() if path.name[0] != "."] if folder.is_dir() else []
     except PermissionError:
+        if is_remote(folder):  # there are no credentials
+            raise
         return []
 
 

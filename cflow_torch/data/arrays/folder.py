@@ -67,7 +67,7 @@ def _usual_places(folder: Path) -> list[Path]:
 
 def _below(folder: Path) -> dict[Path, dict[str, list[Path]]]:
     """Return the folders below a log's that hold clouds, and these of each suffix."""
-    kinds = {path: _kinds(path) for path in sorted(folder.iterdir())} if folder.is_dir() else {}
+    kinds = {path: _kinds(path) for path in sorted(visible(folder))}
     return {path: kinds for path, kinds in kinds.items() if kinds and path.name != GROUND_FOLDER}
 
 

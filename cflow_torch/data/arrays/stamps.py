@@ -88,7 +88,7 @@ def times_of_names(names: Sequence[str]) -> list[int] | None:
 
 
 def _without_counters(names: Sequence[str]) -> Sequence[str]:
-    """Cut off the last number if it has three digits or more in all names, and always grows, usually by less than 10."""
+    """Cut off the last number if it has three digits or more in all names, always grows, and mostly by less than 10."""
     last = [match for match in (re.search(r"(\d{3,})\D*$", name) for name in names) if match]
     numbers = [int(match[1]) for match in last]
     steps = sorted(after - before for before, after in zip(numbers, numbers[1:]))

@@ -68,7 +68,7 @@ class Frames:
     def __init__(self, samples: dict[tuple[str, str], list[Sample]]) -> None:
         by_count = sorted(samples, key=lambda link: len(samples[link]))
         self._parents = {child: parent for parent, child in by_count}
-        self.ignored = [f"{parent} to {child}" for parent, child in by_count if self._parents[child] != parent]
+        self._ignored = [(parent, child) for parent, child in by_count if self._parents[child] != parent]
         self._samples = {child: samples[parent, child] for child, parent in self._parents.items()}
         self._links: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -86,6 +86,11 @@ class Frames:
         while self._parents.get(chain[-1], frame) not in chain:
             chain.append(self._parents[chain[-1]])
         return chain
+
+    def ignored(self, *frames: str) -> str:
+        """Name the transforms to other parents of frames, or of those above them."""
+        used = {each for frame in frames for each in self.chain(frame)}
+        return ", ".join(f"{parent} to {child}" for parent, child in self._ignored if child in used)
 
     def are_joined(self, frame: str, other: str) -> bool:
         return self.chain(frame)[-1] == self.chain(other)[-1]

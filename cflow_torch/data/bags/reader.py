@@ -304,7 +304,7 @@ class BagLog(Log):
             else:
                 self._add_poses(connection.topic, message, arrived, tracks)
         self._frames = Frames(links)
-        ignored = ", ".join(self._frames.ignored)
+        ignored = self._frames.ignored(self._lidar, _BASE)
         self._note(
             f"frames have several parents: we ignore the transforms that are rarer, {ignored}" if ignored else ""
         )

@@ -101,8 +101,8 @@ class KITTILog(ArraysLog):
 
     def sweep(self, index: int) -> Sweep:
         sweep = super().sweep(index)
-        classes = self._classes(index, len(sweep.points))
-        if classes is None or sweep.is_ground is not None:
+        classes = self._classes(index, len(sweep.points)) if sweep.is_ground is None else None
+        if classes is None:
             return sweep
         is_ground = np.isin(classes[0], stored_labels.GROUND)
         return Sweep(sweep.points, is_ground if is_ground.any() else None, sweep.pose, sweep.timestamp_ns)
