@@ -165,35 +165,44 @@ class KITTILog(ArraysLog):
         """
         root, name = self.drive.root, self.drive.clouds.name
         is_raw = self.drive.layout == "raw"
-        folder = root / "oxts" / "data" if is_raw else root / "oxts"
-        wanted = [f"{file.stem}.txt" for file in self.files] if is_raw else [f"{name}.txt"]
-        with remote_errors(root):
-            known = {file.name for file in folder.glob("*.txt") if file.stat().st_size > 0}
         times = self._times_of_oxts() if is_raw else None
-        if times is not None:
-            wanted = [name for name in sorted(known) if int(Path(name).stem) < len(times)]
-        read = read_all([folder / each for each in wanted if each in known], read_numbers, self._note)
-        found = [file for file, numbers in read.items() if numbers.shape[1] > NUM_USED]  # the last may be cut
+        measured, count = self._measurements(times)
         calibration = self._calibration("imu_to_velo")
-        if 2 * len(found) <= len(wanted) or calibration is None:
+        if 2 * len(measured) <= count or calibration is None:
             what = f"there is no oxts/{name}.txt"
             if calibration is None:
                 what = "calib_imu_to_velo.txt of its day is missing" if is_raw else f"calib/{name}.txt is missing"
             elif is_raw:
-                what = f"oxts/data has {len(found)} measurements for {len(wanted)} sweeps"
+                what = f"oxts/data has {len(measured)} measurements for {count} sweeps"
             where = f"{root}{' or the folder of the day' if is_raw else ''}"
             self._note(f"{what}, so it has no poses. Download it to {where}, or set data.odometry=true")
             return None
-        table = np.concatenate([read[file][:, :NUM_USED] for file in found])
-        poses = poses_from_oxts(table, found[0])
+        files = list(measured)
+        poses = poses_from_oxts(np.concatenate(list(measured.values())), files[0])
         names = ("imu_to_velo.R imu_to_velo.T", "Tr_imu_velo", "Tr_imu_to_velo")
         T_world_lidar = poses @ np.linalg.inv(transform(calibration, root, *names))
         poses = np.linalg.inv(T_world_lidar[0]) @ T_world_lidar
         if times is not None:
-            times, rows = np.unique(times[[int(file.stem) for file in found]], return_index=True)
-            return Trajectory(poses[rows], times, False, str(folder))
-        labels = [file.name for file in found] if is_raw else [f"{frame:06d}" for frame in range(len(table))]
-        return Trajectory(poses, None, False, str(folder), labels)
+            times, rows = np.unique(times[[int(file.stem) for file in files]], return_index=True)
+            return Trajectory(poses[rows], times, False, str(files[0].parent))
+        labels = [file.name for file in files] if is_raw else [f"{frame:06d}" for frame in range(len(poses))]
+        return Trajectory(poses, None, False, str(files[0].parent), labels)
+
+    def _measurements(self, times: np.ndarray | None) -> tuple[dict[Path, np.ndarray], int]:
+        """Return the numbers of the measurements in each file that is not cut, (K, 6), and how many files we need.
+
+        `times` are those of drives that are not synchronised.
+        """
+        is_raw = self.drive.layout == "raw"
+        folder = self.drive.root / "oxts" / "data" if is_raw else self.drive.root / "oxts"
+        with remote_errors(folder):
+            known = [file for file in sorted(folder.glob("*.txt")) if file.stat().st_size > 0]
+        wanted = {file.stem for file in self.files} if is_raw else {self.drive.clouds.name}
+        if times is not None:
+            wanted = {file.stem for file in known if int(file.stem) < len(times)}
+        read = read_all([file for file in known if file.stem in wanted], read_numbers, self._note)
+        whole = {file: numbers for file, numbers in read.items() if numbers.shape[1] > NUM_USED}
+        return {file: numbers[:, :NUM_USED] for file, numbers in whole.items()}, len(wanted)
 
     def _times_of_oxts(self) -> np.ndarray | None:
         """Return the nanoseconds of the measurements of a drive that is not synchronised; None = it is.
