@@ -309,6 +309,7 @@ QUOTED = [",".join(f'"{word}"' for word in text.split()) for text in EXACT]
             *(text.replace(" ", f",{k // 5 or ''},", 1).replace(" ", ",") for k, text in enumerate(EXACT)),
         ],
         ["t,x,y,z,qx,qy,qz,qw", *QUOTED],
+        ["export, version 2", "timestamp,x,y,z,qw,qx,qy,qz", "s,m,m,m,1,1,1,1", *W_FIRST],
         ["t,x,y,z,qx,qy,qz,qw", *(text.replace(" ", ", ") + "," for text in EXACT[:-1]), EXACT[-1].replace(" ", ",")],
         ["t,x,y,z,qx,qy,qz,qw,covariance", *(text.replace(" ", ",") + ",nan" for text in EXACT)],
     ],

@@ -49,14 +49,15 @@ def parse_table(content: bytes, path: Path) -> Table:
         lines = _poses_only([line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()])
         start, names = start_of_rows(lines, _FEWEST_NUMBERS)
         rows = [split_line(line) for line in lines[start:] if not line.startswith(COMMENTS)]
-        has_text = sum(_has_letters(line) and not line.startswith(COMMENTS) for line in lines[:start]) > 1
+        texts = [line for line in lines[:start] if _has_letters(line) and not line.startswith(COMMENTS)]
         width = min(map(len, rows), default=0)
-        if has_text or not rows or any(any(row[width:]) for row in rows):  # the last line may lack a comma at its end
+        is_uneven = any(any(row[width:]) for row in rows)  # a line may lack the comma at the end of others
+        if not rows or is_uneven or (len(texts) > 1 and not names):
             raise ValueError("it is empty, or has text before its numbers" if start else "its lines differ in length")
         columns = list(map(_seconds_of_dates, zip(*rows)))
         kept = [k for k, column in enumerate(columns) if is_number(next(filter(None, column), ""))]
-        texts = [column for k, column in enumerate(columns) if k not in kept]
-        labels: list[str] = next((list(column) for column in texts if len(set(column)) == len(column)), [])
+        others = [list(column) for k, column in enumerate(columns) if k not in kept]
+        labels: list[str] = next((column for column in others if len(set(column)) == len(column)), [])
         if not kept:
             raise ValueError("it has no numbers")
         words = np.array([[word or "nan" for word in columns[k]] for k in kept], str).T
@@ -69,18 +70,19 @@ def start_of_rows(lines: Sequence[str], fewest: int) -> tuple[int, list[str]]:
 
     Rows have as many words as the middle line: numbers and empty words, or texts and at least so many numbers. Names
     are in the last line above with one for each column, also if it is a comment (`COMMENTS`); [] = there is none.
+    Lines that repeat a word, such as a unit, come last.
     """
     plain = [line for line in lines if line and not line.startswith(COMMENTS)]
     width = len(split_line(plain[len(plain) // 2])) if plain else 0
     start = next((k for k, line in enumerate(lines) if _is_row(line, width, fewest)), len(lines))
     ends_empty = start < len(lines) and split_line(lines[start])[-1] == ""
+    found = []
     for line in filter(_has_letters, reversed(lines[:start])):
         header = line.lstrip("#%/ ")
         names = re.split("[,;]" if re.search("[,;]", header) else r"\s+", header)
         names += [""] * (ends_empty and len(names) == width - 1)  # each row ends with a comma
-        if len(names) == width:
-            return start, [name.strip(' "') for name in names]
-    return start, []
+        found += [[name.strip(' "') for name in names]] * (len(names) == width)
+    return start, min(found, key=lambda names: len(set(names)) < width, default=[])
 
 
 def _is_row(line: str, width: int, fewest: int) -> bool:
