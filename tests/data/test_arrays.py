@@ -93,6 +93,8 @@ TEXTS = {
     "_6.txt": lambda table: "# from a scanner\n" + lines(np.column_stack([table, table[:, :2]])),
     "_c.txt": lambda table: f"//X Y Z t\n{len(table)}\n" + lines(table),
     "_e.csv": lambda table: "x,y,z,t,\n" + lines(table, ",", ",\n"),
+    "_g.csv": lambda table: "x,y,z,class,t\n"
+    + "".join(f"{row.rpartition(',')[0]},a car,{row.rpartition(',')[2]}" for row in lines(table, ",").splitlines(True)),
     "_f.csv": lambda table: "t,z,y,x\n" + lines(table[:, ::-1], ",", ",\n"),
     ".pts": lambda table: f"{len(table)}\n" + lines(table),
     ".asc": lambda table: "# X Y Z t\n" + lines(table),

@@ -309,14 +309,17 @@ QUOTED = [",".join(f'"{word}"' for word in text.split()) for text in EXACT]
             *(text.replace(" ", f",{k // 5 or ''},", 1).replace(" ", ",") for k, text in enumerate(EXACT)),
         ],
         ["t,x,y,z,qx,qy,qz,qw", *QUOTED],
+        ["t,status,x,y,z,qw,qx,qy,qz", *(text.replace(",", ",not good,", 1) for text in W_FIRST)],
+        [text.replace(" ", ", ", 1) for text in EXACT],
         ["export, version 2", "timestamp,x,y,z,qw,qx,qy,qz", "s,m,m,m,1,1,1,1", *W_FIRST],
         ["t,x,y,z,qx,qy,qz,qw", *(text.replace(" ", ", ") + "," for text in EXACT[:-1]), EXACT[-1].replace(" ", ",")],
         ["t,x,y,z,qx,qy,qz,qw,covariance", *(text.replace(" ", ",") + ",nan" for text in EXACT)],
     ],
 )
 def test_columns_may_be_empty_quoted_or_nan(tmp_path, lines) -> None:
-    (tmp_path / "poses.csv").write_text("\n".join(lines))
-    read = poses_text.read_poses(tmp_path / "poses.csv")
+    (tmp_path / "a").mkdir()  # logs of other tests look into folders of tables
+    (tmp_path / "a" / "poses.csv").write_text("\n".join(lines))
+    read = poses_text.read_poses(tmp_path / "a" / "poses.csv")
     assert read.times_ns is not None and read.times_ns.tolist() == STAMPS
     assert np.allclose(read.poses[:, 0, 3], range(COUNT)) and np.allclose(read.poses[3, 1, 0], 0.96)
 
@@ -469,13 +472,14 @@ def test_poses_near_a_folder_are_those_at_its_times(tmp_path) -> None:
 
 def test_files_that_nobody_named_stop_no_log(tmp_path, monkeypatch) -> None:
     """A folder of another user, a table whose times repeat after its start, and times that end with text."""
-    folder = clouds(tmp_path / "drive")
-    (tmp_path / "other").mkdir()
+    root = tmp_path / "a" / "b"
+    folder = clouds(root / "drive")
+    (root / "other").mkdir()
     list_all = Path.iterdir
     monkeypatch.setattr(Path, "iterdir", lambda path: locked(path) if path.name == "other" else list_all(path))
-    (tmp_path / "cam").mkdir()
+    (root / "cam").mkdir()
     imu = [line(k, seconds(START + k * 10**6)) for k in range(500)]
-    (tmp_path / "cam" / "imu.csv").write_text("\n".join([*imu, line(9, seconds(START))]))
+    (root / "cam" / "imu.csv").write_text("\n".join([*imu, line(9, seconds(START))]))
     with pytest.warns(CFlowWarning, match=r"we do not use imu\.csv: .*times must ascend"):
         assert ArraysLog(folder).poses is None
     numbered = clouds(tmp_path / "numbered" / "drive", range(COUNT))
@@ -498,8 +502,9 @@ def test_times_that_are_no_times_are_an_error_of_ours(tmp_path, bad) -> None:
 
 def test_seconds_and_nanoseconds_may_be_floats(tmp_path) -> None:
     rows_of = [line(k, f"{s // 10**9}.0,{s % 10**9:.1f}", separator=",") for k, s in enumerate(STAMPS)]
-    (tmp_path / "a.csv").write_text("\n".join(["secs,nsecs,x,y,z,qx,qy,qz,qw", *rows_of]))
-    assert poses_text.read_poses(tmp_path / "a.csv").times_ns.tolist() == STAMPS
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "a.csv").write_text("\n".join(["secs,nsecs,x,y,z,qx,qy,qz,qw", *rows_of]))
+    assert poses_text.read_poses(tmp_path / "a" / "a.csv").times_ns.tolist() == STAMPS
 
 
 @pytest.mark.parametrize("name", ["poses.npy.gz", "poses.NPY", "poses.txt.gz", "poses.json.gz"])

@@ -223,12 +223,18 @@ def _text_of(value: Any) -> str:
 
 
 def split_line(line: str) -> list[str]:
-    """Return the words between commas, semicolons or blanks. A word between two commas, or after the last, is empty."""
+    """Return the words between commas or semicolons, of which some are empty, or between blanks.
+
+    Between commas, only numbers are split at blanks.
+    """
     decimal = line.replace(",", ".") if ";" in line else line  # as some languages write numbers
     plain = re.sub(r"(\d[-/.]\d\d) (?=\d\d:)", r"\1T", decimal.replace('"', ""))  # a date and its time are one word
     if "[" in plain or "]" in plain:  # as NumPy prints matrices
         return re.split(r"[\s,;\[\]]+", plain.strip(" \t,;[]"))
-    return re.split(r"\s*[,;]\s*|\s+", plain.strip())
+    cells = re.split(r"\s*[,;]\s*", plain.strip())
+    pieces = [cell.split() for cell in cells]
+    are_split = [len(cells) == 1 or (len(each) > 1 and all(map(is_number, each))) for each in pieces]
+    return [word for cell, each, is_split in zip(cells, pieces, are_split) for word in (each if is_split else [cell])]
 
 
 def is_number(word: str) -> bool:
