@@ -8,10 +8,8 @@ from decimal import Decimal
 from typing import Sequence
 
 _UNITS = (1, 10**3, 10**6, 10**9)  # nanoseconds in ns, us, ms and s
-_SHORTEST, _LONGEST = (
-    12 * 10**5,
-    10**11,
-)  # nanoseconds from one time to the next; of unix times, only the longest counts
+_SHORTEST = 1_200_000  # nanoseconds from one time to the next, which tell the unit
+_LONGEST = 10**11  # the same, of unix times
 _UNIX = range(10**18, 41 * 10**17)  # nanoseconds since 1970: from 2001 to 2099
 # After colons, "-08:00" and "-0800" are a time zone, else "-123456" is a fraction.
 _DATE = re.compile(

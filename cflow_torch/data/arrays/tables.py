@@ -24,11 +24,8 @@ COMMENTS = ("#", "%", "//")
 """Beginnings of lines that are no rows."""
 MATRIX = tuple(f"m{k}" for k in range(16))
 """Names of the entries of a matrix, row by row or column by column; the last four may be missing."""
-_VECTORS = {  # numbers in a list of a JSON file, and a role that the name of the list has -> endings of their names
-    (3, "x"): (".x", ".y", ".z"),
-    (4, "qx"): (".0", ".1", ".2", ".3"),
-    (3, "qx"): (".roll", ".pitch", ".yaw"),
-}
+# Numbers in a list of a JSON file, and the role that the name of the list has -> endings of their names, else 0, 1, ...
+_VECTORS: dict[Any, Sequence[Any]] = {(3, "x"): ("x", "y", "z"), (3, "qx"): ("roll", "pitch", "yaw")}
 
 
 class Table(NamedTuple):
@@ -201,17 +198,10 @@ def _numbers_of(value: Any, name: str) -> Iterator[tuple[str, str]]:
     numbers = _numbers(value)
     if isinstance(value, Decimal):
         yield name, str(value)
-    elif len(numbers) in (12, 16):
-        prefix = f"{name}." if name else ""
-        yield from ((prefix + entry, str(number)) for entry, number in zip(MATRIX, numbers))
     elif numbers:
-        fitting = [
-            ends
-            for (count, role), ends in _VECTORS.items()
-            if count == len(numbers) and role_of_name(f"{name}.x") == role
-        ]
-        ends = fitting[0] if fitting else [f".{k}" for k in range(len(numbers))]
-        yield from ((name + end, str(number)) for end, number in zip(ends, numbers))
+        kind = len(numbers), role_of_name(f"{name}.x")
+        ends = MATRIX if len(numbers) in (12, 16) else _VECTORS.get(kind, range(len(numbers)))
+        yield from ((f"{name}.{end}".lstrip("."), str(number)) for end, number in zip(ends, numbers))
     elif isinstance(value, dict):
         for key, member in value.items():
             yield from _numbers_of(member, f"{name}.{key}" if name else key)
