@@ -51,12 +51,11 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
 
     Convention:
         Parts have the pixels of a sweep that are missing, or of which every other sweep lacks a slice. A part of t
-        takes its velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least
-        half of the older sweeps. A sweep before t-1 counts only if the velocity puts the part inside the region there.
-        A sweep that does not count may still confirm the velocity.
-        Of the velocities of a part of t, or of t+1, the one that the fewest sweeps lack wins, then the one with the
-        smallest errors. In a pair, parts are unmatched components, and the lowest velocity wins. A part belongs to its
-        first node. The velocity of a node must win more slices near its targets than it loses.
+        takes its velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and at t-1 or
+        in at least half of the older sweeps.
+        Of the velocities of a part of t, or of t+1, the one with the smallest errors wins; a sweep without a part has
+        the largest error. In a pair, parts are unmatched components, and the lowest velocity wins. A part belongs to
+        its first node. The velocity of a node must win more slices near its targets than it loses.
 
     Cost: 289 lookups for each part of t, 25 for each sweep and pair of near parts.
     """
@@ -151,13 +150,6 @@ class _Map:
         part = self._part.index_select(0, place.view(-1)).view_as(place)
         return (part - 1).clamp_(min=0).long(), part > 0
 
-    def contains(self, centre: Tensor) -> Tensor:
-        """Tell which places, (2, ...), finest pixels, are in the region, a cell or more from its border, (...) bool."""
-        cell = (centre / self._cell).floor_()
-        last_row_col = (self._height - 2 * _REACH - 2, self._width - 2 * _REACH - 2)
-        last = constant(last_row_col, cell.dtype, cell.device).view(2, *[1] * (cell.ndim - 1))
-        return (cell == torch.minimum(cell.clamp(min=1), last)).all(0)
-
     def _place(self, window: Tensor, step: Tensor, centre: Tensor) -> Tensor:
         """Return the cells of places; the nearest cells for places outside of the region."""
         row, col = (centre / self._cell).floor_().long() + _REACH
@@ -187,39 +179,34 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     place = centre[..., None] - velocity[..., None] * before_t  # [2, H, S]
     part, error = _follow(parts, cells, of_t, place)  # [H, S] each
     moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()  # [H, S]
-    is_found, ranks = _judge(sweeps, window, error, moved, cells.contains(place))
-    kept = flat_nonzero(_are_best(ranks, part, len(parts)))
+    is_found, cost = _judge(sweeps, window, error, moved)
+    kept = flat_nonzero(_are_best(cost, part, len(parts)))
     part, is_found, before_t = gather(kept, part, is_found, before_t)
     return _Tracks(part, is_found, _median_velocity(parts, part, is_found, before_t))
 
 
-def _judge(
-    sweeps: HeightSlicedSweeps, window: Tensor, error: Tensor, moved: Tensor, is_inside: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Tell which sweeps confirm H velocities, and rank these.
+def _judge(sweeps: HeightSlicedSweeps, window: Tensor, error: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
+    """Tell which sweeps confirm H velocities, and what these cost.
 
     Args:
         window: (H,) int64.
         error: (H, S) float64, finest pixels, from where the velocity puts the part to the nearest part of each sweep.
         moved: (H, S) float64, finest pixels, how far the part moves between t and each sweep.
-        is_inside: (H, S) bool, the velocity puts the part inside the region.
 
     Returns:
         is_found: (H, S) bool, the nearest part is near enough.
-        ranks: (2, H) float64, the number of sweeps that lack a part, and the sum of errors. The lowest number is the
-            best, and of equal numbers, the lowest sum. In a pair, all errors are 0, and the shortest way is the best.
-            Both are infinite without a part at t+1, or with parts in less than half of the older sweeps that count.
+        cost: (H,) float64, the lowest is the best: the sum of the squares of errors, as parts of the largest error that
+            confirms the velocity, each at most 1. In a pair, all errors are 0, and the cost is the distance. It is
+            infinite without a part at t+1, or with none at t-1 and in less than half of the older sweeps.
     """
     is_given = sweeps.is_given.index_select(0, window)
-    is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
-    # Outside of the region, an older sweep can confirm nothing, so it does not count. Sweep t-1 always counts.
-    is_counted = is_given & is_inside
-    is_counted[:, :3] = is_given[:, :3]
-    is_confirmed = is_found[:, 0] & (2 * is_found[:, 2:].sum(1) >= is_counted[:, 2:].sum(1))
-    num_lacking = (is_counted & ~is_found).sum(1)
-    way = moved[:, 0] * ~sweeps.has_history.index_select(0, window)  # of pairs
-    total = error.masked_fill(~is_found, 0.0).sum(1) + way
-    return is_found, torch.stack((num_lacking.double(), total)).masked_fill(~is_confirmed, math.inf)
+    limit = _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved
+    is_found = is_given & (error <= limit)
+    is_in_half = 2 * is_found[:, 2:].sum(1) >= is_given[:, 2:].sum(1)
+    is_confirmed = is_found[:, 0] & (is_found[:, 2:3].any(1) | is_in_half)
+    cost = ((error / limit).square().clamp(max=1.0) * is_given).sum(1)
+    cost += moved[:, 0] * ~sweeps.has_history.index_select(0, window)
+    return is_found, cost.masked_fill(~is_confirmed, math.inf)
 
 
 def _follow(parts: _Parts, cells: _Map, of_t: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
@@ -281,21 +268,15 @@ def _are_alike(sweeps: HeightSlicedSweeps, parts: _Parts, of_t: Tensor, other: T
     return is_like | sweeps.has_history.index_select(0, parts.window.index_select(0, of_t))[:, None]
 
 
-def _are_best(ranks: Tensor, part: Tensor, num_parts: int) -> Tensor:
-    """Tell which tracks are the best of their part of t and of their part of t+1, (H,) bool. Ties: the first."""
-    is_best = _are_lowest(ranks, Groups(part[:, 1], num_parts)) & _are_lowest(ranks, Groups(part[:, 0], num_parts))
+def _are_best(cost: Tensor, part: Tensor, num_parts: int) -> Tensor:
+    """Tell which tracks, (H,), have the lowest cost of their part of t and of their part of t+1. Ties: the first."""
+    is_best = cost < math.inf
+    for step in (1, 0):
+        same = Groups(part[:, step], num_parts)
+        is_best &= cost == same.spread(same.min(cost, empty=math.inf))
     same = Groups(part[:, 1], num_parts).where(is_best)
     first = same.spread(same.first(), none=-1)
     return first == torch.arange(len(first), device=first.device)
-
-
-def _are_lowest(ranks: Tensor, groups: Groups) -> Tensor:
-    """Tell which tracks have the lowest ranks of their group, by the first rank, then by the next, (H,) bool."""
-    is_lowest = ranks[0] < math.inf
-    for rank in ranks:
-        rank = rank.masked_fill(~is_lowest, math.inf)
-        is_lowest &= rank == groups.spread(groups.min(rank, empty=math.inf))
-    return is_lowest
 
 
 def _pixels_of(tracks: _Tracks, parts: _Parts) -> Groups:

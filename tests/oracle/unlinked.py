@@ -87,13 +87,13 @@ def link_unlinked(sweeps: SlicedSweeps, may_be_fast: np.ndarray, tree: Tree) -> 
                 sizes = len(parts[i]), len(parts[other])
                 if length / 2 <= distance <= farthest and (not is_pair or max(sizes) <= LIKE * min(sizes)):
                     velocity = (centres[i] - centres[other]) / since[other_step]
-                    rank, track = follow(sweeps, i, velocity, centres, since, around)
-                    # In a pair, all errors are 0, and the shortest way has the lowest rank.
-                    tracks.append((rank + is_pair * distance, track))
+                    cost, track = follow(sweeps, i, velocity, centres, since, around)
+                    # In a pair, all errors are 0, and the shortest way has the lowest cost.
+                    tracks.append((cost + is_pair * distance, track))
     chosen = []
-    for rank, track in tracks:
-        rivals = [[r for r, other in tracks if other.get(step) == track.get(step)] for step in (1, 0)]
-        is_best = rank < math.inf and all(rank == min(ranks) for ranks in rivals)
+    for cost, track in tracks:
+        rivals = [[c for c, other in tracks if other.get(step) == track.get(step)] for step in (1, 0)]
+        is_best = cost < math.inf and all(cost == min(costs) for costs in rivals)
         if is_best and all(track[1] != other[1] for other in chosen):
             chosen.append(track)
     owner: dict[int, int] = {}
@@ -117,24 +117,17 @@ def link_unlinked(sweeps: SlicedSweeps, may_be_fast: np.ndarray, tree: Tree) -> 
 
 
 def follow(sweeps, i, velocity, centres, since, around) -> tuple[float, dict[int, int]]:  # type: ignore[no-untyped-def]
-    """The rank of a velocity of part i, infinite if too few parts confirm it, and its part in each sweep."""
-    track, rank, num_older = {1: i}, 0.0, 0
-    cell = max(1, round(CELL / sweeps.size))
-    most = (np.array(sweeps.image.shape[1:]) - 1) // cell
+    """The cost of a velocity of part i, infinite if too few parts confirm it, and its part in each sweep."""
+    track, cost = {1: i}, 0.0
     for step in range(len(since)):
         expected = centres[i] - velocity * since[step]
         distances = [(float(((centres[p] - expected) ** 2).sum()), p) for p in around(step, expected, NEAR)]
         square, part = min(distances, key=lambda pair: pair[0], default=(math.inf, -1))
         bound = ERROR / sweeps.size + SHARE * math.hypot(*velocity) * abs(since[step])
-        where = np.floor(expected / cell)
-        is_counted = step <= 2 or ((where >= 1) & (where < most)).all()  # a cell or more from the border of the region
-        num_older += step >= 2 and is_counted
         if step == 1:
             continue
         if math.sqrt(square) <= bound:
             track[step] = part
-            rank += math.sqrt(square)
-        elif is_counted:
-            rank += 1 << 20
-    found = sum(step >= 2 for step in track)
-    return (rank if 0 in track and 2 * found >= num_older else math.inf), track
+        cost += min((math.sqrt(square) / bound) ** 2, 1)
+    is_in_half = 2 * sum(step >= 2 for step in track) >= len(since) - 2
+    return (cost if 0 in track and (2 in track or is_in_half) else math.inf), track
