@@ -10,12 +10,12 @@ import torch
 from cflow_torch.tensors import resolution
 from cflow_torch.types import CFlowError, as_numpy, last_row
 
-QUATERNION_TOLERANCE = 1e-3  # only quaternions of length 1 are rotations; lengths in data sets are within 1e-6 of 1
+ROUNDING = 0.02  # of the length of a quaternion, and of |R R^T - I| of a matrix in a file, with two decimals
 # A pose moves all points, so its type must resolve this distance, metres.
 _COARSEST_POSE = 0.01
 _FLATTEST = 1e-4  # metres from the middle of an arc to its chord; flatter ones are taken as straight
 # Largest allowed |R R^T - I|. Poses stored in float32 are within 1e-6.
-_ORTHOGONALITY = 1e-3
+ORTHOGONALITY = 1e-3
 
 
 def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
@@ -40,10 +40,10 @@ def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
         error = np.abs(rotation @ rotation.T - np.eye(3)).max()
         determinant = np.linalg.det(rotation)
     wrong_row = np.abs(bottom - (0, 0, 0, 1)).max()
-    if not (error <= _ORTHOGONALITY and wrong_row <= _ORTHOGONALITY and determinant > 0):
+    if not (error <= ORTHOGONALITY and wrong_row <= ORTHOGONALITY and determinant > 0):
         raise CFlowError(
             f"{name} is not rigid (|R R^T - I| up to {error:.3g}, det {determinant:.3g}, last row "
-            f"{bottom.tolist()}): give [R t; 0 0 0 1] with a rotation R, row-major"
+            f"{bottom.tolist()}): give [R t; 0 0 0 1] with a right-handed rotation R, row-major"
         )
     farthest = max(reach, float(np.abs(result[:3, 3]).max()))
     step = max(resolution(kind, farthest) for kind in (np.dtype(np.float64), dtype) if kind is not None)
@@ -102,17 +102,16 @@ def turn_of(T: np.ndarray) -> np.ndarray:
 def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[int], str]) -> np.ndarray:
     """Build poses, (K, 4, 4) float64, from translations, (K, 3), and quaternions, (K, 4). K may be 0.
 
-    Quaternions are scalar first (w, x, y, z), and of length 1 within `QUATERNION_TOLERANCE`. A row that is not a pose
+    Quaternions are scalar first (w, x, y, z), and of length 1 within `ROUNDING`. A row that is not a pose
     is a `CFlowError`, which begins with `what(row)`.
     """
     shift = np.asarray(translation, dtype=np.float64).reshape(-1, 3)
     rotation = np.asarray(quaternion, dtype=np.float64).reshape(-1, 4)
-    is_unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) <= QUATERNION_TOLERANCE
+    is_unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) <= ROUNDING
     for row in np.flatnonzero(~(np.isfinite(shift).all(axis=1) & is_unit)):
         raise CFlowError(
             f"{what(int(row))} is not a rigid motion: quaternion (w, x, y, z) and translation must be finite, the "
-            f"quaternion of length 1, got {rotation[row].tolist()}, {shift[row].tolist()}; write more digits, or copy "
-            "the file again"
+            f"quaternion of length 1, got {rotation[row].tolist()}, {shift[row].tolist()}; are these the right columns?"
         )
     return as_matrix(to_rotations(rotation), shift)
 

@@ -18,7 +18,7 @@ from cflow_torch.data.folders import distinct_names, find_folders, visible
 from cflow_torch.data.log import CachedLog, Log, LogWrapper, add_gaps_in_time
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
-from cflow_torch.data.paths import as_path, exist, is_path_like, remote_errors, safe_name
+from cflow_torch.data.paths import as_path, exist, is_path_like, remote_errors, safe_name, suffix_of
 from cflow_torch.data.read_as import read_as as read_log_as
 from cflow_torch.ground.segmentation import GROUND_METHODS, has_ground
 from cflow_torch.ground.segmentation import find_ground as ground_of
@@ -62,7 +62,8 @@ DATA_SETS: dict[str, DataSet] = {
     "kiss_icp": DataSet("KissICPLog", "data for a loader of KISS-ICP"),
     "arrays": DataSet("ArraysLog", "folder of point clouds", (), "find_array_logs"),  # tried if no mark is found
 }
-_NAMED_BY_PATH = ("arrays", "bags", "pandaset")  # logs that have the names of their files or folders
+_NAMED_BY_PATH = ("arrays", "bags", "kitti", "pandaset")  # logs that have the names of their files or folders
+_OF_LAYOUTS = ("dataset", "sequences", "velodyne")  # folders whose names tell no log from another
 _DEEPEST = 6  # levels below the root that are searched for a mark
 
 
@@ -74,13 +75,13 @@ class UserSource(NamedTuple):
 
 
 class RenamedSource(NamedTuple):
-    """A file or folder of a log whose name others have, too."""
+    """A source of a log whose name others have, too."""
 
-    path: Path
+    source: Any
     name: str
 
     def __str__(self) -> str:
-        return str(self.path)
+        return str(self.source)
 
 
 def recognise(root: Any) -> str:
@@ -143,10 +144,12 @@ def find_all_sources(name: str, paths: Sequence[Any]) -> list[Any]:
     return _with_distinct_names(list(found.values())) if name in _NAMED_BY_PATH else list(found.values())
 
 
-def _with_distinct_names(sources: Sequence[Path]) -> list[Any]:
+def _with_distinct_names(sources: Sequence[Any]) -> list[Any]:
     """Rename logs of equal names, as results of both would be in one folder."""
-    names = [source.name if source.is_dir() else source.stem for source in sources]
-    distinct = distinct_names(names, [source.absolute().parts[1:-1][::-1] for source in sources])
+    places = [getattr(source, "folder", source) for source in sources]
+    names = [place.name if place.is_dir() else place.stem for place in places]
+    above = [[part for part in place.absolute().parts[-2:0:-1] if part not in _OF_LAYOUTS] for place in places]
+    distinct = distinct_names(names, above)
     renamed = zip(sources, names, distinct)
     return [source if name == other else RenamedSource(source, other) for source, name, other in renamed]
 
@@ -172,10 +175,10 @@ def _why_nothing_fits(top: Path) -> str:
 
     level, suffixes = [top], Counter()  # type: ignore[var-annotated]
     for _ in range(_DEEPEST):
-        suffixes.update(path.suffix.lower() for path in level if path.is_file())
+        suffixes.update(suffix_of(path) or path.suffix for path in level if path.is_file())
         level = [path for folder in level for path in visible(folder)]
     if not suffixes:
-        return "it has no files" if top.is_dir() else ""
+        return "it has no files that you may read" if top.is_dir() else ""
     suffix, count = suffixes.most_common(1)[0]
     clouds = [kind for kind in suffixes if kind in SUFFIXES] or [kind for kind in suffixes if kind in TEXTS]
     if clouds and all(suffixes[kind] == 1 for kind in clouds):
@@ -297,7 +300,7 @@ def open_log(
     if odometry and name == "hdf5":
         settings = {"needs_poses": False, **settings}
     new_name = source.name if isinstance(source, RenamedSource) else ""
-    source = source.path if isinstance(source, RenamedSource) else source
+    source = source.source if isinstance(source, RenamedSource) else source
     if isinstance(source, UserSource):
         log = _user_logs(name, settings)[source.number]
     else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from typing import Iterable, Sequence
 
+AXES = ("x", "y", "z")
 # Names without punctuation and units, as drivers, odometry programs and exports of ROS messages write them.
 _ROTATION = "(q|.*quat|.*quaternion|.*orientation|.*rot|.*rotation|.*heading|qrs)"
 _POSITION = "(t|p|pos|prsr|.*position|.*translation|.*location)?"
@@ -23,6 +24,7 @@ _ROLES = {
     "pitch": ".*pitch(deg|degrees|rad|radians)?",
     "yaw": ".*(yaw|heading|theta)(deg|degrees|rad|radians)?",
 }
+_TIME_OF_POINT = "((d|delta)?t|.*time|.*stamp|(t|.*time|.*stamp)?offset)(s|secs?|nsecs?|ns|us|ms|unix)?"
 _OTHERS = "twist|linear|angular|veloc|accel|covariance|rate"
 
 
@@ -30,6 +32,11 @@ def distinct_names(names: Sequence[str], padding: str = "") -> list[str]:
     """Number the repetitions of a name: intensity, intensity_2. The name of `padding` stays."""
     counts = [list(names[:k]).count(name) for k, name in enumerate(names, 1)]
     return [name if count == 1 or name == padding else f"{name}_{count}" for name, count in zip(names, counts)]
+
+
+def default_names(count: int) -> list[str]:
+    """Return the names of columns without names: x, y, z, column_3, ..."""
+    return [*AXES, *(f"column_{k}" for k in range(3, count))]
 
 
 def role_of_name(name: str) -> str | None:
@@ -45,7 +52,7 @@ def role_of_name(name: str) -> str | None:
 
 def time_columns(names: Iterable[str]) -> list[str]:
     """Return those of the names that columns with times of points have."""
-    return [name for name in names if role_of_name(name) == "time" or _plain(name) in ("dt", "offset", "timeoffset")]
+    return [name for name in names if re.fullmatch(_TIME_OF_POINT, _plain(name))]
 
 
 def _plain(name: str) -> str:

@@ -7,6 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, Callable, Sequence, TypeVar
 
+from cflow_torch.data.paths import is_remote
 from cflow_torch.errors import CFlowError
 
 _T = TypeVar("_T")
@@ -29,9 +30,10 @@ def search(
     found: list[_T] = []
     level = [root]
     for _ in range(depth + 1):
-        here = [(folder, find(folder)) for folder in level]
+        children_of = {folder: visible(folder) for folder in level}
+        here = [(children, find(folder)) for folder, children in children_of.items() if children]
         found += [each for _, all_found in here for each in all_found]
-        children = [child for folder, all_found in here if not all_found for child in visible(folder)]
+        children = [child for children, all_found in here if not all_found for child in children]
         level = [child for child in children if is_passed(child) and child.is_dir()]
     return found
 
@@ -42,8 +44,13 @@ def find_folders(root: Path, is_log: Callable[[Path], bool], depth: int, what: s
 
 
 def visible(folder: Path) -> list[Path]:
-    """Return the files and folders in a folder that are not hidden; [] if it is a file."""
-    return [path for path in folder.iterdir() if path.name[0] != "."] if folder.is_dir() else []
+    """Return the files and folders in a folder that are not hidden; [] if it is a file, or of another user."""
+    try:
+        return [path for path in folder.iterdir() if path.name[0] != "."] if folder.is_dir() else []
+    except PermissionError:
+        if is_remote(folder):  # there are no credentials
+            raise
+        return []
 
 
 def natural_key(name: str) -> tuple[Any, ...]:

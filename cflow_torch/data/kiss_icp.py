@@ -52,7 +52,9 @@ class KissICPLog(Log):
             self._dataset = datasets.dataset_factory(loader, self.root, **settings)
             self.timestamps = range(len(self._dataset))
             poses = getattr(self._dataset, "gt_poses", None)
-            self.poses = None if poses is None else np.asarray(poses, np.float64).reshape(len(self), 4, 4)
+            self.poses = None if poses is None else np.asarray(poses, np.float64).reshape(-1, 4, 4)
+        if self.poses is not None and len(self.poses) != len(self):
+            raise CFlowError(f"{self._what} has {len(self.poses)} poses for {len(self)} sweeps; copy both again")
         self._check_count(self._what)
 
     def sweep(self, index: int) -> Sweep:

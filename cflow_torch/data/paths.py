@@ -125,6 +125,16 @@ def read_start(path: Path, count: int) -> bytes:
         return file.read(count)
 
 
+def suffix_of(path: Path) -> str:
+    """Return the suffix of a file's format, without `.gz`, in lower case."""
+    return (path.with_suffix("") if path.suffix.lower() == GZ else path).suffix.lower()
+
+
+def stem_of(path: Path) -> str:
+    """Return the name of a file without its suffixes."""
+    return (path.with_suffix("") if path.suffix.lower() == GZ else path).stem
+
+
 def source_for_random_access(path: Path) -> Any:
     """Return a large file for a library that reads parts of it: its name, or an open file if it is remote.
 

@@ -7,6 +7,7 @@ from typing import Any, Callable, Mapping, NamedTuple
 import numpy as np
 
 from cflow_torch.data.column_names import time_columns
+from cflow_torch.windows.returns import missing_returns
 
 _UNITS = (10**9, 10**6, 10**3, 1)  # nanoseconds in s, ms, us and ns
 # Seconds in which the middle half of the points is measured. The range is below a factor of 1000, so one unit fits.
@@ -129,8 +130,9 @@ def _is_share(known: np.ndarray) -> bool:
 
 def _turns(shares: np.ndarray, points: np.ndarray) -> float:
     """Return the turns, at most 1, of a LiDAR that measures points at shares of a sweep; 1 if it does not rotate."""
-    part = (shares * _PARTS).astype(np.int64).clip(0, _PARTS - 1)
-    angle = np.arctan2(points[:, 1], points[:, 0])
+    is_return = ~missing_returns(points)
+    part = (shares[is_return] * _PARTS).astype(np.int64).clip(0, _PARTS - 1)
+    angle = np.arctan2(points[is_return, 1], points[is_return, 0])
     sines, cosines = (np.bincount(part, f(angle), _PARTS) for f in (np.sin, np.cos))
     steps = np.diff(np.unwrap(np.arctan2(sines, cosines)))
     turns = abs(float(np.median(steps))) * _PARTS / (2 * np.pi)

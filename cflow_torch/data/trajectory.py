@@ -6,7 +6,7 @@ from typing import NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.transforms import interpolate_motion, rigid_transform
+from cflow_torch.transforms import ORTHOGONALITY, ROUNDING, interpolate_motion, rigid_transform
 from cflow_torch.types import CFlowError
 
 # Nanoseconds between two poses over which we interpolate: half a second, or more if poses are regular and rarer.
@@ -52,7 +52,8 @@ class Trajectory(NamedTuple):
 def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
     """Check (K, 4, 4) or (K, 3, 4) rigid motions and return them as (K, 4, 4) float64. Errors name the `source`.
 
-    Poses that are not finite, or have a rotation of zeros, are unknown: NaN. If all are, that is an error.
+    Matrices with few decimals become the nearest rotations. Poses that are not finite, or have a rotation of zeros, are
+    unknown: NaN. If all are, that is an error.
     """
     if matrices.ndim != 3 or matrices.shape[1:] not in ((3, 4), (4, 4)) or matrices.dtype.kind not in "fiu":
         raise CFlowError(f"{source} has shape {matrices.shape} and dtype {matrices.dtype}; pass (K, 4, 4) numbers")
@@ -62,6 +63,11 @@ def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
     if is_unknown.all():
         raise CFlowError(f"{source} has no pose of finite numbers")
     poses[is_unknown] = np.eye(4)
+    rotations = poses[:, :3, :3].astype(np.float64)
+    error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    is_rounded = (error > ORTHOGONALITY) & (error <= ROUNDING)
+    left, _, right = np.linalg.svd(rotations[is_rounded])
+    poses[is_rounded, :3, :3] = left @ right
     checked = np.stack([rigid_transform(pose, f"pose {row} of {source}") for row, pose in enumerate(poses)])
     checked[is_unknown] = np.nan
     return checked

@@ -91,6 +91,11 @@ TEXTS = {
     ".txt": lambda table: lines(table),
     "_3.txt": lambda table: "  " + lines(table[:, :3], "   ", "  \r\n  ").rstrip(),
     "_6.txt": lambda table: "# from a scanner\n" + lines(np.column_stack([table, table[:, :2]])),
+    "_c.txt": lambda table: f"//X Y Z t\n{len(table)}\n" + lines(table),
+    "_e.csv": lambda table: "x,y,z,t,\n" + lines(table, ",", ",\n"),
+    "_g.csv": lambda table: "x,y,z,class,t\n"
+    + "".join(f"{row.rpartition(',')[0]},a car,{row.rpartition(',')[2]}" for row in lines(table, ",").splitlines(True)),
+    "_f.csv": lambda table: "t,z,y,x\n" + lines(table[:, ::-1], ",", ",\n"),
     ".pts": lambda table: f"{len(table)}\n" + lines(table),
     ".asc": lambda table: "# X Y Z t\n" + lines(table),
     ".xyz": lambda table: "//x\ty\tz\tt\n" + lines(table, "\t"),
@@ -108,7 +113,7 @@ def test_clouds_are_read_from_texts(tmp_path, suffix):
     assert len(log) == 3 and len(log.poses) == 3
     has_empty_row = suffix == "_t.csv"
     assert np.array_equal(log.sweep(1).points[has_empty_row:], tables[1, :, :3].astype(np.float32))
-    if suffix in (".csv", ".CSV", "_.csv", ".asc", ".xyz"):
+    if suffix in (".csv", ".CSV", "_.csv", "_c.txt", "_e.csv", "_f.csv", ".asc", ".xyz"):
         assert np.array_equal(log.columns(1)["t"], tables[1, :, 3])
 
 
@@ -260,6 +265,12 @@ def test_organised_arrays_have_a_row_per_point(tmp_path):
         assert np.array_equal(read_cloud(tmp_path / name), points.reshape(-1, 3))
         copy_rows(tmp_path / name, tmp_path / "few.npy", np.arange(32) < 5)
         assert np.array_equal(read_cloud(tmp_path / "few.npy"), points.reshape(-1, 3)[:5])
+    image = np.arange(4 * 64 * 1024, dtype=np.float32).reshape(64, 1024, 4)
+    np.save(tmp_path / "channels.npy", np.moveaxis(image, 2, 0))
+    assert np.array_equal(read_cloud(tmp_path / "channels.npy"), image.reshape(-1, 4)[:, :3])
+    np.savez(tmp_path / "organised.npz", pcl=image[..., :3], ring=image[..., 3], pose=np.eye(4))
+    assert np.array_equal(read_cloud(tmp_path / "organised.npz"), image.reshape(-1, 4)[:, :3])
+    assert np.array_equal(read_columns(tmp_path / "organised.npz")["ring"], image[..., 3].ravel())
     np.save(tmp_path / "turned.npy", points.reshape(-1, 3).repeat(9, axis=0).T)
     assert np.array_equal(read_cloud(tmp_path / "turned.npy"), points.reshape(-1, 3).repeat(9, axis=0))
 
@@ -270,6 +281,9 @@ def test_clouds_of_two_sensors_in_one_folder_need_a_choice(tmp_path):
     with pytest.raises(CFlowError, match=r"front_\*\.npy, rear_\*\.npy: choose one by suffix"):
         ArraysLog(tmp_path)
     assert [sweep.points[0, 0] for sweep in ArraysLog(tmp_path, suffix="rear_*.npy")] == [3, 4]
+    np.save(tmp_path / "front_2.npy", np.full((3, 3), 9.0))
+    with pytest.raises(CFlowError, match=r"front_\*\.npy, rear_\*\.npy: choose one by suffix"):
+        ArraysLog(tmp_path)
 
 
 def test_files_with_other_contents_are_refused(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Callable
@@ -14,7 +15,7 @@ from tiny_recording import TinyRecording
 
 from cflow_torch import CFlowError
 from cflow_torch.data.bags import BagLog, find_bags
-from cflow_torch.data.bags.messages import cloud_columns
+from cflow_torch.data.bags.messages import cloud_columns, points_of
 from cflow_torch.data.catalog import open_log, recognise
 from cflow_torch.types import CFlowWarning
 
@@ -244,6 +245,35 @@ def test_corrections_of_a_map_do_not_move_the_ego(tmp_path) -> None:
     assert world(log, bag.recording) < 5e-3
 
 
+def test_of_two_parents_of_a_frame_the_one_with_more_samples_is_used(tmp_path) -> None:
+    bag = Recorder(tmp_path)
+    bag.mount()
+    bag.drive()
+    for stamp in bag.stamps:
+        far = bag.recording.pose_at(stamp)
+        far[:3, 3] += 100
+        bag.transform(stamp, "map", "base_link", far)
+    for parent in ("base_link", "velodyne", "velodyne"):
+        bag.transform(bag.stamps[0], parent, "camera", np.eye(4))
+    bag.clouds()
+    with pytest.warns(
+        CFlowWarning, match="several parents: we ignore the transforms that are rarer, map to base_link$"
+    ):
+        log = BagLog(bag.close())
+    assert world(log, bag.recording) < 5e-3
+
+
+def test_a_bad_transform_of_another_frame_stops_no_bag(tmp_path) -> None:
+    bag = Recorder(tmp_path)
+    bag.mount()
+    bag.drive()
+    bad = bag.writer.transform(bag.stamps[0], "base_link", "camera", np.eye(4))
+    bad.transform.rotation.w = 1e3
+    bag.writer.write("/tf", bag.stamps[0], TF, [bad])
+    bag.clouds()
+    assert world(BagLog(bag.close()), bag.recording) < 5e-3
+
+
 def test_a_gap_splits_windows(tmp_path) -> None:
     bag = Recorder(tmp_path)
     bag.mount()
@@ -275,8 +305,9 @@ LIVOX = {
 }
 
 
-def test_custom_messages_of_livox_are_read(tmp_path) -> None:
-    bag = Recorder(tmp_path)
+@pytest.mark.parametrize("form", ["ros1", "ros2"])
+def test_custom_messages_of_livox_are_read(tmp_path, form: str) -> None:
+    bag = Recorder(tmp_path, form)
     for name, definition in LIVOX.items():
         bag.writer.types.register(typesys.get_types_from_msg(definition, f"livox_ros_driver2/msg/{name}"))
     kinds = [f"livox_ros_driver2/msg/{name}" for name in LIVOX]
@@ -287,7 +318,14 @@ def test_custom_messages_of_livox_are_read(tmp_path) -> None:
         ]
         header = bag.writer.header(stamp, "livox")
         bag.writer.write("/livox", stamp, kinds[1], header, stamp, len(points), 0, np.zeros(3, np.uint8), points)
-    log = BagLog(bag.close())
+    path = bag.close()
+    for file in path.glob("*.db3"):  # ROS 2 Humble does not store definitions
+        base = sqlite3.connect(file)
+        if base.execute("SELECT name FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
+            base.execute("DELETE FROM message_definitions")
+        base.commit()
+        base.close()
+    log = BagLog(path)
     assert np.allclose(log.sweep(2).points, bag.recording.units(2)[0].points, atol=1e-5)
     assert np.allclose(log.sweep(2).point_times, np.arange(40) * 2.5e-3)
     assert log.columns(2)["reflectivity"].tolist() == list(range(40))
@@ -310,10 +348,17 @@ def test_unfinished_recordings_say_what_to_do(tmp_path) -> None:
         BagLog(bag)
 
 
+@pytest.mark.parametrize("missing", [0.0, np.inf, np.nan])
 @pytest.mark.parametrize("order", "<>")
-def test_a_wrong_byte_order_is_found(tmp_path, order: str) -> None:
+def test_a_wrong_byte_order_is_found(tmp_path, order: str, missing: float) -> None:
     writer, points = BagWriter(tmp_path, "ros1"), np.random.default_rng(0).normal(0, 20, (50, 3)).astype(np.float32)
+    points[:20] = missing
     message: Any = SimpleNamespace(**vars(writer.make(CLOUD, *writer.cloud(0, points, None, order))))
     for message.is_bigendian in (False, True):
-        columns = cloud_columns(message)
-        assert np.array_equal(np.stack([columns[axis] for axis in "xyz"], 1).astype(np.float32), points)
+        assert np.array_equal(points_of(cloud_columns(message)).astype(np.float32), points[20:])
+
+
+def test_a_cloud_of_no_usual_numbers_has_the_byte_order_that_it_states(tmp_path) -> None:
+    writer = BagWriter(tmp_path, "ros1")
+    message = writer.make(CLOUD, *writer.cloud(0, np.full((50, 3), 1e-9) * np.arange(1, 51)[:, None], None))
+    assert np.abs(points_of(cloud_columns(message))).max() < 1e-6

@@ -38,6 +38,7 @@ def test_the_layout_is_recognised(tmp_path, columns: int, kind: str, shuffled: b
     found = read_cloud(tmp_path / "a.bin")
     assert found.dtype == np.dtype(kind).newbyteorder("=") and np.array_equal(found, table[:, :3])
     assert np.array_equal(read_cloud(tmp_path / "a.bin", columns), table[:, :3])
+    assert find_bin_layout(few_digits.tobytes(), columns) == BinLayout(columns, kind)
 
 
 def test_missing_returns_and_reflectances_of_zero_change_nothing() -> None:
@@ -46,8 +47,17 @@ def test_missing_returns_and_reflectances_of_zero_change_nothing() -> None:
         table[::2] = 0
         table[:, 3:] *= np.arange(len(table))[:, None] % 5 == 0
         assert find_bin_layout(table.tobytes()).columns == columns
-        table[::2] = np.nan
-        assert find_bin_layout(table.tobytes()).columns == columns
+        for missing in (np.nan, np.inf):
+            table[::2] = missing
+            assert find_bin_layout(table.tobytes()).columns == columns
+
+
+def test_with_given_columns_only_positions_tell_the_type() -> None:
+    table = street(5, "<f8")
+    table[:, 4] = 1.7e9 + np.arange(len(table)) * 1e-5
+    assert find_bin_layout(table.tobytes(), 5) == BinLayout(5, "<f8")
+    with pytest.raises(CFlowError, match=r"4 numbers per point are no coordinates.*numpy\.save"):
+        find_bin_layout((street(4) * 1000).astype(np.int32).tobytes(), 4)
 
 
 def test_near_points_of_one_reflectance_do_not_look_like_float64() -> None:

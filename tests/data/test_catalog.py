@@ -113,6 +113,8 @@ def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Pat
     ("names", "message"),
     [
         ([], "it has no files"),
+        (["a.pcd.gz"], r"it has one file of points \(\.pcd\)"),
+        (["a.gz"], r"its 1 \.gz files are not read: unpack them"),
         (["a.las", "b.laz", "c.las"], "its 2 .las files are not read: convert them with pdal"),
         (["a/1.xyz", "a/2.xyz"], "its 2 .xyz files are not read"),
         (["a/1.xyz"], r"it has one file of points \(.xyz\); .* a file for each of two sweeps"),

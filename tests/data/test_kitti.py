@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from test_bin_layout import street
 
-from cflow_torch.data.catalog import find_sources, open_log, recognise
+from cflow_torch.data.catalog import Logs, find_all_sources, find_sources, open_log, recognise, source_name
 from cflow_torch.data.kitti import KITTILog, find_kitti_drives
 from cflow_torch.transforms import rotations_about
 from cflow_torch.types import CFlowError, CFlowWarning
@@ -209,6 +210,22 @@ def test_a_raw_drive_with_an_empty_measurement_or_without_the_folder_data_is_rea
     assert drive.name == "drive" and np.allclose(KITTILog(drive).poses, whole.poses)
 
 
+def test_a_measurement_that_is_cut_and_an_empty_line_of_times_lose_one_sweep(tmp_path: Path) -> None:
+    folder = write_raw(tmp_path / "day" / "drive", 4)
+    times = folder / "velodyne_points" / "timestamps.txt"
+    lines = times.read_text().splitlines(keepends=True)
+    times.write_text("".join([*lines[:2], "\n", lines[2]]))
+    (folder / "velodyne_points" / "data" / "0000000002.bin").unlink()
+    for content in (oxts(1)[:50], "  \n", "\0" * 90):
+        (folder / "oxts" / "data" / "0000000001.txt").write_text(content)
+        with pytest.warns(CFlowWarning, match="1 of 3 sweeps have no pose"):
+            log = KITTILog(folder)
+        assert log.timestamps == [1317042145_594360375 + 103_000_000 * index for index in (0, 2)]
+        assert np.allclose(
+            np.linalg.inv(log.poses[0]) @ log.poses[1], np.linalg.matrix_power(step_pose(), 3), atol=1e-5
+        )
+
+
 def test_a_drive_that_is_not_synchronised_takes_poses_by_their_times(tmp_path: Path) -> None:
     """Drives called _extract have clouds as texts, and ten measurements a sweep."""
     folder = write_raw(tmp_path / "day" / "drive_extract")
@@ -223,6 +240,11 @@ def test_a_drive_that_is_not_synchronised_takes_poses_by_their_times(tmp_path: P
         (measured / f"{index:010d}.txt").write_text(oxts(index / 10))  # type: ignore[arg-type]
     stamps = "".join(f"2011-09-26 13:02:{25 + time:.9f}\n" for time in times)
     (folder / "oxts" / "timestamps.txt").write_text(stamps)
+    for k, name in enumerate((4, 5)):  # the other way round, as some of KITTI's are
+        (measured / f"{name:010d}.txt").write_text(oxts((5 - k) / 10))  # type: ignore[arg-type]
+    swapped = stamps.splitlines(keepends=True)
+    swapped[4:6] = swapped[5:3:-1]
+    (folder / "oxts" / "timestamps.txt").write_text("".join(swapped))
     log = KITTILog(folder)
     assert log.timestamps == whole.timestamps and np.allclose(log.poses, whole.poses, atol=1e-6)
     assert log.trajectory is not None and len(log.trajectory[0]) == 21
@@ -329,13 +351,38 @@ def test_classes_of_semantic_kitti_become_labels_and_ground(tmp_path: Path) -> N
         log.sweep(1)
 
 
+def test_labels_of_some_sweeps_and_clouds_of_other_columns_are_read(tmp_path: Path) -> None:
+    folder = write_sequence(tmp_path / "sequences" / "08", has_classes=True)
+    (folder / "labels" / "000001.label").unlink()
+    log = KITTILog(folder)
+    assert log.sweep(0).is_ground is not None and log.labels(0) is not None
+    assert log.sweep(1).is_ground is None and log.labels(1) is None and log.moving(1) is None
+    for file in (folder / "labels").iterdir():
+        file.unlink()
+    for columns, names in ((3, []), (5, ["reflectance", "column_4"])):
+        for file in log.files:
+            street(columns).tofile(file)
+        log = KITTILog(folder)
+        assert log.sweep(0).is_ground is None and list(log.columns(0)) == names and log.labels(0) is None
+
+
+def test_only_points_in_the_image_of_the_drive_are_annotated(tmp_path: Path) -> None:
+    folder = write_raw(tmp_path / "day" / "drive")
+    whole = KITTILog(folder).labels(0).is_valid
+    (folder / "image_02" / "data").mkdir(parents=True)
+    Image.new("RGB", (500, 375)).save(folder / "image_02" / "data" / "0000000000.png")
+    assert KITTILog(folder).labels(0).is_valid.sum() < whole.sum()
+
+
 def test_drives_of_one_folder_have_distinct_names_nested_or_not(tmp_path: Path) -> None:
     for name in ("2011_09_26/2011_09_26_drive_0001_sync", "2011_09_28/2011_09_28_drive_0001_sync", "drive_9_sync"):
         write_raw(tmp_path / "raw" / name)
     for data_set in ("a", "b"):
         write_sequence(tmp_path / data_set / "sequences" / "00")
-    names = [drive.name for drive in find_kitti_drives(tmp_path)]
-    assert sorted(names) == ["2011_09_26_drive_0001_sync", "2011_09_28_drive_0001_sync", "a-00", "b-00", "drive_9_sync"]
+    expected = ["2011_09_26_drive_0001_sync", "2011_09_28_drive_0001_sync", "a-00", "b-00", "drive_9_sync"]
+    for paths in ([tmp_path], [tmp_path / "raw", tmp_path / "a", tmp_path / "b"]):
+        logs = Logs("kitti", find_all_sources("kitti", paths), {"check": False, "deskew": "off", "find_ground": None})
+        assert sorted(map(source_name, logs.sources)) == expected == sorted(log.log_id for log in logs)
 
 
 def test_a_folder_velodyne_of_other_clouds_is_a_folder_of_clouds(tmp_path: Path) -> None:

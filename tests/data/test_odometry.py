@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -112,6 +113,17 @@ def test_without_the_package_the_message_names_the_fix(drive, monkeypatch):
         with pytest.raises(CFlowError, match=r"pip install small-gicp.*poses\.txt"):
             call(NoPoses(drive))
     assert with_poses(drive) is drive, "nothing is estimated where poses are known"
+
+
+def test_poses_of_a_loader_that_are_not_one_per_sweep_are_refused(tmp_path, monkeypatch):
+    class Three(list):
+        gt_poses = np.tile(np.eye(4), (2, 1, 1))
+
+    loaders = SimpleNamespace(available_dataloaders=lambda: ["kitti"], dataset_factory=lambda *_: Three([0, 0, 0]))
+    monkeypatch.setitem(sys.modules, "kiss_icp", loaders)
+    monkeypatch.setitem(sys.modules, "kiss_icp.datasets", loaders)
+    with pytest.raises(CFlowError, match="loader kitti has 2 poses for 3 sweeps"):
+        open_log("kiss_icp", tmp_path, loader="kitti")
 
 
 @needs_kiss_icp

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.cloud_file import write_cloud
 from cflow_torch.data.arrays.folder import find_array_logs
 from cflow_torch.data.arrays.reader import ArraysLog
-from cflow_torch.data.arrays.stamps import times_of_names
+from cflow_torch.data.arrays.stamps import nanoseconds_of_dates, nanoseconds_of_numbers, times_of_names
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.log import Log, window
@@ -171,6 +173,28 @@ def test_other_names_are_no_times(first: str) -> None:
     assert times_of_names([first, first[:-1] + "2"]) is None and times_of_names(["1.5", "a"]) is None
 
 
+@pytest.mark.parametrize("start", ["2023-05-12-10-00-00_", "20230512_", "os1.", "2023-05-12 10:00:00."])
+def test_numbers_that_count_the_files_are_no_times(start: str) -> None:
+    for step in (1, 5):
+        assert times_of_names([f"{start}{k:06d}" for k in range(0, 60, step)]) is None
+    names = [f"1700000000.{k:03d}_{number:06d}" for number, k in enumerate(range(0, 900, 50))]
+    assert times_of_names(names) == [1_700_000_000_000_000_000 + 50_000_000 * k for k in range(18)]
+
+
+def test_the_fractions_of_regular_times_are_no_counter() -> None:
+    stamps = [1_700_000_000_000_000_000 + k * 100_000_000 + 1000 * (k * 7 % 11) for k in range(600)]
+    assert times_of_names([f"{stamp // 10**9}.{stamp % 10**9 // 1000:06d}" for stamp in stamps]) == stamps
+
+
+def test_dates_may_have_a_time_zone() -> None:
+    noon, utc = "2023-11-14T22:13:20", 1_700_000_000_000_000_000
+    zones = {"": 0, "Z": 0, "+08:00": -8, "-0330": 3.5, ".25+01:00": -1, "_25": 0}
+    for end, hours in zones.items():
+        expected = utc + int(hours * 3600) * 10**9 + (250_000_000 if "25" in end else 0)
+        assert nanoseconds_of_dates([noon + end]) == [expected], end
+    assert nanoseconds_of_dates(["2023-11-14-22-13-20-0250"]) == [utc + 25_000_000]
+
+
 def test_a_missing_sweep_shortens_windows_and_fails_its_pairs(tmp_path) -> None:
     log: Log = ArraysLog(clouds(tmp_path))
     (tmp_path / f"{STAMPS[5]}.npy").rename(tmp_path / "5.moved")
@@ -236,7 +260,6 @@ def test_layouts_of_poses(tmp_path, layout) -> None:
         "radians",
         "time, by columns",
         "time and angles",
-        "vertices of g2o",
     )
     assert (read.times_ns is not None) == has_times and (not has_times or read.times_ns[2] == 2 * 10**9)
 
@@ -273,11 +296,78 @@ def test_places_on_the_globe_become_metres(tmp_path) -> None:
     assert np.allclose(read.poses[:, :3, :3], rotations_about(2, 0.5))
 
 
+W_FIRST = [line(k, seconds(stamp), "t x y z qw qx qy qz", ",") for k, stamp in enumerate(STAMPS)]
+QUOTED = [",".join(f'"{word}"' for word in text.split()) for text in EXACT]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["timestamp,frame,x,y,z,qw,qx,qy,qz", *(text.replace(",", ",,", 1) for text in W_FIRST)],
+        [
+            "t,note,x,y,z,qx,qy,qz,qw",
+            *(text.replace(" ", f",{k // 5 or ''},", 1).replace(" ", ",") for k, text in enumerate(EXACT)),
+        ],
+        ["t,x,y,z,qx,qy,qz,qw", *QUOTED],
+        ["t,status,x,y,z,qw,qx,qy,qz", *(text.replace(",", ",not good,", 1) for text in W_FIRST)],
+        [text.replace(" ", ", ", 1) for text in EXACT],
+        ["export, version 2", "timestamp,x,y,z,qw,qx,qy,qz", "s,m,m,m,1,1,1,1", *W_FIRST],
+        ["t,x,y,z,qx,qy,qz,qw", *(text.replace(" ", ", ") + "," for text in EXACT[:-1]), EXACT[-1].replace(" ", ",")],
+        ["t,x,y,z,qx,qy,qz,qw,covariance", *(text.replace(" ", ",") + ",nan" for text in EXACT)],
+    ],
+)
+def test_columns_may_be_empty_quoted_or_nan(tmp_path, lines) -> None:
+    (tmp_path / "a").mkdir()  # logs of other tests look into folders of tables
+    (tmp_path / "a" / "poses.csv").write_text("\n".join(lines))
+    read = poses_text.read_poses(tmp_path / "a" / "poses.csv")
+    assert read.times_ns is not None and read.times_ns.tolist() == STAMPS
+    assert np.allclose(read.poses[:, 0, 3], range(COUNT)) and np.allclose(read.poses[3, 1, 0], 0.96)
+
+
+def test_labels_of_rows_stay_with_their_poses(tmp_path) -> None:
+    lines = [f"{name},{line(k, str(k), separator=',')}" for k, name in ((2, "c"), (0, "a"), (1, "b"))]
+    (tmp_path / "poses.csv").write_text("\n".join(["name,t,x,y,z,qx,qy,qz,qw", *lines]))
+    read = poses_text.read_poses(tmp_path / "poses.csv")
+    assert read.labels == ["a", "b", "c"] and read.poses[:, 0, 3].tolist() == [0, 1, 2]
+
+
+def test_keys_of_a_graph_are_no_times(tmp_path) -> None:
+    """GTSAM writes keys that are a letter in the upper bits of 64."""
+    folder = clouds(tmp_path, [f"{k:06d}" for k in range(COUNT)])
+    for first in (0, 8646911284551352320):
+        lines = [f"VERTEX_SE3:QUAT {first + k} {line(k, '').strip()}" for k in range(COUNT)]
+        (folder / "graph.g2o").write_text("\n".join(lines))
+        log = ArraysLog(folder, "graph.g2o")
+        assert log.poses[:, 0, 3].tolist() == list(range(COUNT)) and not log._has_times
+
+
+def test_a_table_may_have_a_column_of_times(tmp_path) -> None:
+    clouds(tmp_path, range(COUNT))
+    (tmp_path / "times.txt").write_text("\n".join(["frame,time", *(f"{k},{seconds(t)}" for k, t in enumerate(STAMPS))]))
+    assert ArraysLog(tmp_path).timestamps == STAMPS
+    (tmp_path / "times.txt").write_text("1 2\n2 3\n")
+    with pytest.raises(CFlowError, match="one time per line, or a column called time"):
+        poses_text.read_times(tmp_path / "times.txt")
+    (tmp_path / "times.txt").write_text("1 2\n2 3\n", "utf-16")
+    with pytest.raises(CFlowError, match="in UTF-8"):
+        poses_text.read_times(tmp_path / "times.txt")
+
+
 def test_lines_with_times_may_have_any_order(tmp_path) -> None:
     texts = [line(k, seconds(stamp)) for k, stamp in enumerate(STAMPS)]
     (tmp_path / "poses.txt").write_text("\n".join(reversed(texts)))
     read = poses_text.read_poses(tmp_path / "poses.txt")
     assert read.times_ns.tolist() == STAMPS and np.allclose(read.poses[:, 0, 3], range(COUNT))
+
+
+def test_matrices_by_columns_may_begin_at_the_origin(tmp_path) -> None:
+    poses = POSES.copy()
+    poses[:, :3, 3] -= poses[2, :3, 3]
+    by_columns = poses.transpose(0, 2, 1)
+    (tmp_path / "poses.json").write_text(json.dumps(by_columns.tolist()))
+    assert np.allclose(poses_text.read_poses(tmp_path / "poses.json").poses, poses)
+    (tmp_path / "poses.txt").write_text("\n".join(rows(by_columns.reshape(12, 16))))
+    assert np.allclose(poses_text.read_poses(tmp_path / "poses.txt").poses, poses)
 
 
 def test_four_numbers_are_a_matrix_only_if_every_fourth_line_ends_it(tmp_path) -> None:
@@ -380,6 +470,58 @@ def test_poses_near_a_folder_are_those_at_its_times(tmp_path) -> None:
         assert ArraysLog(folder).poses is None
 
 
+def test_files_that_nobody_named_stop_no_log(tmp_path, monkeypatch) -> None:
+    """A folder of another user, a table whose times repeat after its start, and times that end with text."""
+    root = tmp_path / "a" / "b"
+    folder = clouds(root / "drive")
+    (root / "other").mkdir()
+    list_all = Path.iterdir
+    monkeypatch.setattr(Path, "iterdir", lambda path: locked(path) if path.name == "other" else list_all(path))
+    (root / "cam").mkdir()
+    imu = [line(k, seconds(START + k * 10**6)) for k in range(500)]
+    (root / "cam" / "imu.csv").write_text("\n".join([*imu, line(9, seconds(START))]))
+    with pytest.warns(CFlowWarning, match=r"we do not use imu\.csv: .*times must ascend"):
+        assert ArraysLog(folder).poses is None
+    numbered = clouds(tmp_path / "numbered" / "drive", range(COUNT))
+    lines = [str(k / 10) for k in range(3000)]
+    (numbered / "camera_timestamps.txt").write_text("\n".join([*lines, "end"]))
+    with pytest.warns(CFlowWarning, match=r"we do not use camera_timestamps\.txt"):
+        assert not ArraysLog(numbered)._has_times
+
+
+def locked(path: Any) -> Any:
+    raise PermissionError(f"{path}: permission denied")
+
+
+@pytest.mark.parametrize("bad", ["nan", "1e400", "9" * 40])
+def test_times_that_are_no_times_are_an_error_of_ours(tmp_path, bad) -> None:
+    (tmp_path / "times.txt").write_text(f"{bad}\n1.0\n")
+    with pytest.raises(CFlowError, match=r"times\.txt"):
+        poses_text.read_times(tmp_path / "times.txt")
+
+
+def test_seconds_and_nanoseconds_may_be_floats(tmp_path) -> None:
+    rows_of = [line(k, f"{s // 10**9}.0,{s % 10**9:.1f}", separator=",") for k, s in enumerate(STAMPS)]
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "a.csv").write_text("\n".join(["secs,nsecs,x,y,z,qx,qy,qz,qw", *rows_of]))
+    assert poses_text.read_poses(tmp_path / "a" / "a.csv").times_ns.tolist() == STAMPS
+
+
+@pytest.mark.parametrize("name", ["poses.npy.gz", "poses.NPY", "poses.txt.gz", "poses.json.gz"])
+def test_poses_may_be_compressed_and_suffixes_large(tmp_path, name) -> None:
+    folder = clouds(tmp_path, [f"{k:06d}" for k in range(COUNT)])
+    content = io.BytesIO()
+    np.save(content, POSES)
+    texts = {"npy": content.getvalue(), "txt": "\n".join(rows(POSES[:, :3].reshape(12, 12))).encode()}
+    texts["json"] = json.dumps(POSES.tolist()).encode()
+    raw = texts[name.split(".")[1].lower()]
+    (folder / name).write_bytes(gzip.compress(raw) if name.endswith("gz") else raw)
+    with pytest.warns(CFlowWarning, match=f"its poses are those of {name}"):
+        assert np.allclose(ArraysLog(folder).poses, POSES, atol=1e-6)
+    (folder / name).write_bytes(gzip.compress(raw)[:60] + b"broken" * 9)
+    assert ArraysLog(folder).poses is None
+
+
 def test_poses_may_be_arrays_of_the_clouds(tmp_path) -> None:
     """A matrix, or a position and a quaternion; and a time, unless it is not in the order of the names."""
     quaternions = to_quaternions(POSES[:, :3, :3])[:, (1, 2, 3, 0)]
@@ -402,6 +544,33 @@ def test_poses_may_be_arrays_of_the_clouds(tmp_path) -> None:
         assert np.allclose(log.poses, POSES, atol=1e-9) and log.has_viewpoints
         assert log.sweep(3).points.shape == (6, 3)
         assert np.diff(log.timestamps).tolist() == [10**8 if "stamp" in name else 1] * (len(POSES) - 1)
+
+
+def test_rotations_with_few_decimals_become_the_nearest_ones(tmp_path) -> None:
+    tum = [f"{k} {k} 0 0 0 0 0.71 0.71" for k in range(12)]
+    (tmp_path / "poses.txt").write_text("\n".join(tum))
+    assert np.allclose(poses_text.read_poses(tmp_path / "poses.txt").poses[:, :2, 0], (0, 1), atol=1e-12)
+    for decimals in (2, 3):
+        np.savetxt(tmp_path / "poses.txt", POSES[:, :3].reshape(12, 12), f"%.{decimals}f")
+        read = poses_text.read_poses(tmp_path / "poses.txt").poses
+        assert np.allclose(read, POSES, atol=2 * 10**-decimals)
+    mirrored = POSES[:, :3] * (1, 1, -1, 1)
+    np.savetxt(tmp_path / "poses.txt", mirrored.reshape(12, 12), "%.3f")
+    with pytest.raises(CFlowError, match="not rigid.*right-handed"):
+        poses_text.read_poses(tmp_path / "poses.txt")
+
+
+def test_unknown_poses_do_not_hide_where_the_vehicle_drives(tmp_path) -> None:
+    """Poses of the LiDAR next to KITTI's calibration of the camera, one of zeros."""
+    clouds(tmp_path, [f"{k:06d}" for k in range(COUNT)])
+    poses = np.tile(np.eye(4)[:3], (COUNT, 1, 1))
+    poses[:, 0, 3] = range(COUNT)
+    poses[4] = 0
+    np.savetxt(tmp_path / "poses.txt", poses.reshape(COUNT, 12))
+    (tmp_path / "calib.txt").write_text("Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
+    with pytest.warns(CFlowWarning, match="drive along x"):
+        log = ArraysLog(tmp_path)
+    assert log.poses[:, 0, 3].tolist() == [k for k in range(COUNT) if k != 4]
 
 
 def test_numbers_of_files_tell_missing_sweeps(tmp_path) -> None:
@@ -470,6 +639,23 @@ def test_times_from_another_start_have_the_unit_of_their_steps(tmp_path) -> None
     for unit, step in ((1, 0.1), (10**3, 100), (10**6, 100_000), (10**9, 100_000_000)):
         np.savetxt(tmp_path / "times.txt", 0.1 * unit * np.arange(12), "%.7g" if unit == 1 else "%d")
         assert ArraysLog(tmp_path).timestamps == [k * 100_000_000 for k in range(12)], step
+
+
+@pytest.mark.parametrize(
+    ("first", "step", "unit"),
+    [
+        (150 * 10**9, 10**8, 1),  # since boot
+        (1_700_000_000, 10**8, 1),  # since boot, of the size of unix seconds
+        (150 * 10**9, 2_500_000, 1),  # 400 poses a second
+        (3 * 86_400 * 10**6, 10**5, 10**3),
+        (300_000 * 10**6, 10**5, 10**3),  # of the GPS week
+        (1_700_000_000, 1, 10**9),
+        (5, 1, 10**9),
+    ],
+)
+def test_times_of_any_size_have_the_unit_of_their_steps(first: int, step: int, unit: int) -> None:
+    times = [first + k * step for k in range(12)]
+    assert nanoseconds_of_numbers([str(time) for time in reversed(times)]) == [time * unit for time in reversed(times)]
 
 
 def test_rare_poses_are_joined_by_arcs_and_not_called_late() -> None:

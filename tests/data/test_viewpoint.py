@@ -75,6 +75,15 @@ def test_viewpoints_need_poses_and_pcd(tmp_path) -> None:
         write_array_log(drive, tmp_path, ".npy", "world")
 
 
+def test_viewpoints_of_zeros_are_lost_poses(tmp_path) -> None:
+    for k in range(4):
+        viewpoint = (0.0,) * 7 if k == 2 else (k, 0, 0, 1, 0, 0, 0)
+        write_cloud(tmp_path / f"{k}.pcd", np.full((3, 3), k + 1, np.float32), viewpoint=viewpoint)
+    with pytest.warns(CFlowWarning, match="1 of 4 sweeps have no pose, or one of NaN or zeros"):
+        log = ArraysLog(tmp_path)
+    assert log.poses[:, 0, 3].tolist() == [0, 1, 3] and log.gaps == {1}
+
+
 def test_unset_viewpoints_are_no_poses(tmp_path) -> None:
     for k in range(2):
         write_cloud(tmp_path / f"{k}.pcd", np.ones((3, 3), np.float32))

@@ -15,6 +15,7 @@ _SHARE = 0.95  # of the numbers have such a size; of numbers read in a wrong typ
 _EXPLAINED, _AS_GOOD = 0.05, 0.9  # least share of the variance, and the share of the best that a smaller number needs
 _FARTHEST, _LONGEST_RECORD = 1e4, 64  # size of coordinates, and bytes of a record
 _FEWEST = 1000  # points of a file that tell its layout
+_FIX = "pass bin_columns, the numbers per point (4 in KITTI, 5 in nuScenes), or convert other types with numpy.save"
 _MOST, _BLOCK = 1 << 17, 840  # numbers that we test; a multiple of all numbers of columns
 
 
@@ -55,7 +56,7 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
 
     Args:
         content: the whole file.
-        columns: numbers per point; None = find out.
+        columns: numbers per point; None = find out. Then only x, y and z tell the type: a time may have any size.
 
     Convention: the type is the one, float32 or float64, little- or big-endian, in which numbers have sizes of
         coordinates. Columns differ in size (z is smaller than x and y, intensities are larger). We choose the number of
@@ -66,10 +67,11 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
     Raises:
         CFlowError: no layout fits. The message names `bin_columns`.
     """
-    kind = _type_of(content)
+    kind = _type_of(content, columns)
     if columns is not None:
-        is_whole = kind != "" and len(content) % (np.dtype(kind).itemsize * columns) == 0
-        return BinLayout(columns, kind if is_whole else "<f4")
+        if not kind:
+            raise CFlowError(f"x, y, z of {columns} numbers per point are no coordinates in float32 or float64: {_FIX}")
+        return BinLayout(columns, kind)
     fitting = [BinLayout(count, kind) for count in _COLUMNS if kind]
     fitting = [layout for layout in fitting if len(content) % layout.step == 0]
     explained = [_explained(_numbers(content, layout.kind), layout.columns) for layout in fitting]
@@ -86,8 +88,7 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
     counts = ", ".join(map(str, sorted(_COLUMNS)))
     raise CFlowError(
         f"it has {len(content)} bytes, and does not look like points of {counts} float32 or float64 numbers, x, y, z "
-        "first, or records that begin with these. If it is complete, pass bin_columns, the numbers per point: 4 in "
-        "KITTI, 5 in nuScenes"
+        f"first, or records that begin with these: {_FIX}"
     )
 
 
@@ -98,23 +99,23 @@ def _are_records(content: bytes, layout: BinLayout) -> bool:
     with np.errstate(invalid="ignore"):  # numbers of another type may be signalling NaN
         points = layout.table(content[: _FEWEST * layout.step]).astype(np.float64)
     size = np.abs(points)
-    is_usual = ((size > _SMALLEST) & (size < _FARTHEST)) | (size == 0) | np.isnan(size)
+    is_usual = ((size > _SMALLEST) & (size < _FARTHEST)) | (size == 0) | ~np.isfinite(size)
     # Columns of one number are padding or counters, read as floats.
     return bool(is_usual.mean() >= _SHARE) and all(len(np.unique(column)) > _FEWEST // 4 for column in points.T)
 
 
-def _type_of(content: bytes) -> str:
+def _type_of(content: bytes, columns: int | None) -> str:
     """Return the type of the numbers, "<f4", "<f8", ">f4" or ">f8"; "" = they fit none."""
-    return _type_in(content, "<") or _type_in(content, ">")
+    return _type_in(content, "<", columns) or _type_in(content, ">", columns)
 
 
-def _type_in(content: bytes, order: str) -> str:
+def _type_in(content: bytes, order: str, columns: int | None) -> str:
     """Return the type of numbers of an order of bytes. float32 can look like float64, but not the reverse."""
-    halves = _numbers(content, f"{order}f4")
-    is_float64 = are_plausible(_numbers(content, f"{order}f8"))
-    if not are_plausible(halves):
+    is_float32, is_float64 = (are_plausible(_numbers(content, order + kind, columns)) for kind in ("f4", "f8"))
+    if not is_float32:
         return f"{order}f8" if is_float64 else ""
     # The lower halves of float64 numbers with few digits are zeros, so they look like float32, too.
+    halves = _numbers(content, f"{order}f4")
     shares = [float((half == 0).mean()) if len(half) else 0.0 for half in (halves[::2], halves[1::2])]
     low, high = shares if order == "<" else shares[::-1]
     return f"{order}f8" if is_float64 and low > 0.5 > high else f"{order}f4"
@@ -123,13 +124,18 @@ def _type_in(content: bytes, order: str) -> str:
 def are_plausible(numbers: np.ndarray) -> bool:
     """Test whether floats, of any shape, are in a type and byte order that fits: nearly all have usual sizes."""
     size = np.abs(numbers)
-    is_usual = (size == 0) | np.isnan(size) | ((size > _SMALLEST) & (size < _LARGEST))
+    is_usual = (size == 0) | ~np.isfinite(size) | ((size > _SMALLEST) & (size < _LARGEST))
     return bool(is_usual.sum() >= _SHARE * is_usual.size)
 
 
-def _numbers(content: bytes, kind: str) -> np.ndarray:
-    """Return the numbers of the file, or evenly spaced blocks of them. Blocks keep the column of each number."""
+def _numbers(content: bytes, kind: str, columns: int | None = None) -> np.ndarray:
+    """Return the numbers of the file, or evenly spaced blocks of them. Blocks keep the column of each number.
+
+    With `columns`, they are only x, y and z.
+    """
     numbers = np.frombuffer(content, kind, len(content) // np.dtype(kind).itemsize)
+    if columns is not None:
+        numbers = numbers[: len(numbers) // columns * columns].reshape(-1, columns)[:, :3].reshape(-1)
     if len(numbers) > _MOST:
         blocks = numbers[: len(numbers) // _BLOCK * _BLOCK].reshape(-1, _BLOCK)
         numbers = blocks[:: len(numbers) // _MOST + 1].reshape(-1)
@@ -140,9 +146,10 @@ def _numbers(content: bytes, kind: str) -> np.ndarray:
 def _explained(numbers: np.ndarray, columns: int) -> float:
     """Return the share of the variance of log sizes that the column explains, less what chance explains, 0 to 1.
 
-    Zeros and NaN are ignored, because they mean "no return". But a column of zeros besides x, y, z explains all.
+    Zeros, NaN and infinite values are ignored, because they mean "no return". But a column of zeros besides x, y, z
+    explains all.
     """
-    known = np.abs(np.nan_to_num(numbers)) > 0
+    known = np.isfinite(numbers) & (numbers != 0)
     sizes = np.log(np.clip(np.abs(numbers[known]), 1e-2, None))
     column = np.flatnonzero(known) % columns
     counts = np.bincount(column, minlength=columns)

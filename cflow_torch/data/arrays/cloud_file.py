@@ -17,15 +17,18 @@ from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS, BinLayout, find_bi
 from cflow_torch.data.arrays.pcd import pcd_fields, pcd_viewpoint, pypcd4
 from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.column_names import AXES, default_names
 from cflow_torch.data.file_errors import file_errors, shortened
-from cflow_torch.data.paths import GZ, PathLike, as_path, read_bytes
+from cflow_torch.data.paths import PathLike, as_path, read_bytes, suffix_of
+from cflow_torch.data.paths import stem_of as stem_of
 from cflow_torch.tensors import resolution
 from cflow_torch.types import CFlowError, check_array
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
 """Suffixes of clouds that are read and written. Texts (`cloud_text.SUFFIXES`), and `.gz` after any, are only read."""
-_AXES = ("x", "y", "z")
 _COARSEST = 1e-3  # metres
+_LARGEST_POSE = 16  # numbers of an array that may be a pose or its time
+_MOST_CHANNELS = 16  # of an organised cloud
 _MOST_COLUMNS = 64  # of a cloud with fewer points than columns; more are those of a cloud that is transposed
 _TABLES: dict[str, Any] = {  # suffix -> function that reads, and one that writes
     ".feather": (feather.read_table, feather.write_feather),
@@ -87,7 +90,7 @@ def _other_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     kept = {}
     for name, values in fields.items():
         kind = values.dtype
-        if name.lower() not in _AXES and values.shape == shape and kind.kind in "biuf" and kind.itemsize <= 8:
+        if name.lower() not in AXES and values.shape == shape and kind.kind in "biuf" and kind.itemsize <= 8:
             kept[name] = values.astype(kind.newbyteorder("="), copy=False)
     return kept
 
@@ -96,12 +99,8 @@ def small_arrays(path: Path) -> dict[str, Any]:
     """Read the arrays of an `.npz` file that may be a pose or its time: up to 16 numbers, as nested lists."""
     with file_errors(path, _hint(path)):
         arrays = _plain_arrays(read_bytes(path))
-    return {name: array.tolist() for name, array in arrays.items() if _is_small(array) and array.dtype.kind in "fiu"}
-
-
-def _is_small(array: np.ndarray) -> bool:
-    """Test whether an array may be a pose or its time."""
-    return array.size <= 16
+    small = {name: array for name, array in arrays.items() if array.size <= _LARGEST_POSE}
+    return {name: array.tolist() for name, array in small.items() if array.dtype.kind in "fiu"}
 
 
 def in_single(points: np.ndarray) -> np.ndarray:
@@ -142,10 +141,10 @@ def write_cloud(
     for name, values in named.items():
         check_array(values, f"column {name}", (len(points),), "biuf", f"({len(points)},) numbers, one per point")
     fields = {}
-    for name, values in (*zip(_AXES, points.T), *named.items()):
+    for name, values in (*zip(AXES, points.T), *named.items()):
         allowed = re.sub("[^!-~]", "_", name) if suffix in (".pcd", ".ply") else name
         fields[allowed] = _storable(values, suffix)
-    if all(name == f"column_{k}" for k, name in enumerate(named, 3)):
+    if [*AXES, *named] == default_names(3 + len(named)):
         points, named = np.column_stack([points, *named.values()]), {}
     with atomic_file(path) as file:
         if suffix == ".pcd":
@@ -215,16 +214,6 @@ def _write_pcd(file: Any, fields: Mapping[str, np.ndarray], viewpoint: Any) -> N
     cloud.save(file, pcd.Encoding.BINARY)
 
 
-def suffix_of(path: Path) -> str:
-    """Return the suffix of a cloud's format, without `.gz`, in lower case."""
-    return (path.with_suffix("") if path.suffix.lower() == GZ else path).suffix.lower()
-
-
-def stem_of(path: Path) -> str:
-    """Return the name of a cloud without its suffixes."""
-    return (path.with_suffix("") if path.suffix.lower() == GZ else path).stem
-
-
 def _suffix(path: Path) -> str:
     """Return the suffix of a cloud to write."""
     return _checked_suffix(path, path.suffix.lower(), SUFFIXES)
@@ -253,11 +242,11 @@ def _storable(values: np.ndarray, suffix: str) -> np.ndarray:
 
 
 def _positions(fields: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-    if not set(_AXES) <= set(fields):
+    if not set(AXES) <= set(fields):
         fields = {name.lower(): values for name, values in fields.items()}  # X, Y, Z
-    if not set(_AXES) <= set(fields):
+    if not set(AXES) <= set(fields):
         raise CFlowError(f"it has {list(fields)}; it needs x, y, z")
-    return [fields[axis] for axis in _AXES]
+    return [fields[axis] for axis in AXES]
 
 
 def _read(path: Path, bin_columns: int | BinLayout | None) -> Mapping[str, np.ndarray]:
@@ -295,35 +284,39 @@ def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:
         return {name: array[name] for name in array.dtype.names}
     if array.ndim != 2 or array.shape[1] < 3 or array.shape[1] > max(_MOST_COLUMNS, len(array)):
         raise CFlowError(f"it has an array of shape {array.shape}; it must be (N, 3+), columns x, y, z first")
-    return dict(zip((*_AXES, *(f"column_{k}" for k in range(3, array.shape[1]))), array.T))
+    return dict(zip(default_names(array.shape[1]), array.T))
 
 
 def _by_rows(array: np.ndarray) -> np.ndarray:
-    """Return an organised cloud, (H, W) or (H, W, C), or a transposed one, (C, N), with a row per point."""
+    """Return an organised cloud, (H, W), (H, W, C) or (C, H, W), or a transposed one, (C, N), with a row per point."""
     num_axes = 1 if array.dtype.names is not None else 2
     if array.ndim == num_axes == 2 and 3 <= len(array) <= _MOST_COLUMNS < array.shape[1]:
         return array.T
+    if array.ndim == num_axes + 1 == 3 and 3 <= len(array) <= _MOST_CHANNELS < array.shape[2]:
+        array = np.moveaxis(array, 0, -1)
     return array.reshape(-1, *array.shape[-1:][: num_axes - 1]) if array.ndim == num_axes + 1 else array
 
 
 def _plain_arrays(content: bytes) -> dict[str, np.ndarray]:
-    """Read the arrays of an .npz file. Pickled objects in it stay unread."""
+    """Read the arrays of an .npz file, organised ones with a row per point. Pickled objects in it stay unread."""
     arrays = {}
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         for name in archive.files:
             with suppress(ValueError):
                 arrays[name] = archive[name]
-    return arrays
+    largest = max(arrays.values(), key=lambda array: array.size, default=np.zeros(0))  # the cloud
+    grid = largest.shape[:2] if largest.ndim == 3 else None
+    return {k: v.reshape(-1, *v.shape[2:]) if v.shape[:2] == grid else v for k, v in arrays.items()}
 
 
 def _archive_columns(content: bytes) -> dict[str, np.ndarray]:
     """Return the columns of the cloud in an .npz file."""
     arrays = _plain_arrays(content)
-    if set(_AXES) <= set(arrays):
+    if set(AXES) <= set(arrays):
         return arrays
     tables = {name: array for name, array in arrays.items() if array.ndim == 2 and array.shape[1] >= 3}
     named = [array for name, array in tables.items() if name in _CLOUD_KEYS]
-    named = named or [array for array in tables.values() if not _is_small(array)] or list(tables.values())
+    named = named or [array for array in tables.values() if array.size > _LARGEST_POSE] or list(tables.values())
     if len(named) != 1:
         need = f"x, y, z, or one (N, 3+) array, named {_CLOUD_KEYS[0]} if there are several"
         raise CFlowError(f"it has the arrays {shortened(list(arrays))}; pass plain arrays {need}")
@@ -333,9 +326,9 @@ def _archive_columns(content: bytes) -> dict[str, np.ndarray]:
 def _table_columns(read: Any, content: bytes) -> dict[str, np.ndarray]:
     table = read(pa.BufferReader(content), use_threads=False)
     table.validate(full=True)
-    if not set(_AXES) <= set(table.column_names):
-        table = table.rename_columns([*_AXES, *table.column_names[3:]][: table.num_columns])
-    if any(table.column(axis).null_count for axis in _AXES if axis in table.column_names):
+    if not set(AXES) <= set(table.column_names):
+        table = table.rename_columns([*AXES, *table.column_names[3:]][: table.num_columns])
+    if any(table.column(axis).null_count for axis in AXES if axis in table.column_names):
         raise CFlowError("x, y, z must not have empty entries")
     kinds = (pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean)
     return {

@@ -11,11 +11,12 @@ from typing import Any, Callable, Container, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays import cloud_text
-from cflow_torch.data.arrays.cloud_file import SUFFIXES, stem_of, suffix_of
+from cflow_torch.data.arrays.cloud_file import SUFFIXES
 from cflow_torch.data.arrays.poses_text import STRUCTURED, files_of_poses, parse_poses, parse_times, read_poses
 from cflow_torch.data.arrays.stamps import times_of_names
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders, natural_key, visible
-from cflow_torch.data.paths import PathLike, as_path, is_remote, read_start
+from cflow_torch.data.paths import PathLike, as_path, is_remote, read_start, stem_of, suffix_of
 from cflow_torch.data.trajectory import Trajectory
 from cflow_torch.types import CFlowError
 
@@ -66,7 +67,7 @@ def _usual_places(folder: Path) -> list[Path]:
 
 def _below(folder: Path) -> dict[Path, dict[str, list[Path]]]:
     """Return the folders below a log's that hold clouds, and these of each suffix."""
-    kinds = {path: _kinds(path) for path in sorted(folder.iterdir())} if folder.is_dir() else {}
+    kinds = {path: _kinds(path) for path in sorted(visible(folder))}
     return {path: kinds for path, kinds in kinds.items() if kinds and path.name != GROUND_FOLDER}
 
 
@@ -91,7 +92,8 @@ def _kinds(folder: Path) -> dict[str, list[Path]]:
 def _alike(files: Sequence[Path]) -> dict[str, list[Path]]:
     """Return the files of each suffix that has two or more, or of each pattern of names.
 
-    They have several patterns if their names differ only by what is not a number: front_001.pcd, rear_001.pcd.
+    They have several patterns if mostly the same numbers are in names that differ otherwise: front_001.pcd,
+    rear_001.pcd.
     """
     suffixes: dict[str, list[Path]] = {}
     for path in files:
@@ -101,10 +103,10 @@ def _alike(files: Sequence[Path]) -> dict[str, list[Path]]:
         patterns: dict[str, list[Path]] = {}
         for path in same:
             patterns.setdefault(_pattern(path), []).append(path)
-        numbers = {
-            tuple(sorted("-".join(re.findall(r"\d+", stem_of(path))) for path in each)) for each in patterns.values()
-        }
-        kinds.update(patterns if len(numbers) == 1 < len(patterns) < len(same) else {suffix: same})
+        numbers = [{"-".join(re.findall(r"\d+", stem_of(path))) for path in each} for each in patterns.values()]
+        fewest = min(map(len, numbers))
+        are_sensors = fewest > 1 < len(patterns) and 2 * len(set.intersection(*numbers)) > fewest
+        kinds.update(patterns if are_sensors else {suffix: same})
     return {kind: same for kind, same in kinds.items() if len(same) > 1}
 
 
@@ -116,9 +118,10 @@ def _pattern(path: Path) -> str:
 def _is_text_cloud(path: Path) -> bool:
     """Test whether a text holds many points, and no poses. Lines of 3 or 6 numbers may be either: they are points."""
     try:
-        start = read_start(path, _TESTED)
-        columns = cloud_text.text_columns(start[: start.rfind(b"\n") + 1])
-    except (CFlowError, OSError, EOFError, ValueError):
+        with file_errors(path):
+            start = read_start(path, _TESTED)
+            columns = cloud_text.text_columns(start[: start.rfind(b"\n") + 1])
+    except CFlowError:
         return False
     numbers = np.column_stack(list(columns.values()))
     are_poses = _start_of(path, parse_poses) is not None and numbers.shape[1] not in (3, 6)
@@ -175,8 +178,8 @@ def find_tables(folder: Path, clouds: Container[Path] = ()) -> tuple[list[Path],
     Files of times also say so in their name, because a column of numbers may be anything. We read the start of each,
     without the `clouds`.
     """
-    tables = sorted(path for path in visible(folder) if path.suffix.lower() in _TABLES and path not in clouds)
-    folders = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
+    tables = sorted(path for path in visible(folder) if suffix_of(path) in _TABLES and path not in clouds)
+    folders = sorted(path for path in visible(folder) if path.is_dir())
     starts = {path: _start_of(path, parse_poses) for path in tables}
     poses = [path for path, start in starts.items() if start is not None and len(start.poses) > 1]
     times = [path for path in tables if re.search("time|stamp", path.stem.lower())]
@@ -187,48 +190,59 @@ def find_tables(folder: Path, clouds: Container[Path] = ()) -> tuple[list[Path],
     return poses, times
 
 
-def find_poses_near(folder: Path, times_ns: Sequence[int]) -> tuple[Trajectory | None, str]:
+def find_poses_near(folder: Path, times_ns: Sequence[int], tell: Callable[[str], None]) -> Trajectory | None:
     """Find the file of text that has poses at the unix times of most sweeps: below a folder, and two levels above it.
 
     Of folders next to the log or below it, we look only into those that hold nothing but tables, as others are logs. We
-    read the start of at most 50 files in each of at most 50 folders.
-
-    Returns:
-        The poses, None = no file has them, or several do; and what the user should know of it.
+    read the start of at most 50 files in each of at most 50 folders. None = no file has them, or several do. `tell` is
+    called with what the user should know of it.
     """
     if is_remote(folder) or times_ns[0] < _FIRST_UNIX:
-        return None, ""
+        return None
     top = folder.resolve()
     levels = [top, *islice(top.parents, 2)]
     children = {child: sorted(visible(child))[:_MOST] for level in levels for child in sorted(visible(level))[:_MOST]}
-    plain = [files for files in children.values() if all(file.suffix in _TABLES for file in files)]
-    files = [file for files in (*map(visible, levels), *plain) for file in files if file.suffix in _NEAR_TABLES]
-    starts = ((file, _start_of(file, parse_poses)) for file in files)
-    timed = [read_poses(file) for file, start in starts if start is not None and start.times_ns is not None]
-    found = [trajectory for trajectory in timed if trajectory.covers(times_ns)]
+    plain = [files for files in children.values() if all(suffix_of(file) in _TABLES for file in files)]
+    files = [file for files in (*map(visible, levels), *plain) for file in files if suffix_of(file) in _NEAR_TABLES]
+    starts = {file: _start_of(file, parse_poses) for file in files}
+    timed = [file for file, start in starts.items() if start is not None and start.times_ns is not None]
+    found = [each for each in read_all(timed, read_poses, tell).values() if each.covers(times_ns)]
     names = " and ".join(each.source for each in found)
     if len(found) > 1:
-        return None, f"there are poses at the times of its sweeps in {names}: choose one with data.poses=FILE"
-    if not found:
-        return None, ""
-    return found[0], f"its poses are those of {names}, which has them at the times of its sweeps"
+        tell(f"there are poses at the times of its sweeps in {names}: choose one with data.poses=FILE")
+    elif found:
+        tell(f"its poses are those of {names}, which has them at the times of its sweeps")
+    return found[0] if len(found) == 1 else None
+
+
+def read_all(files: Sequence[Path], read: Callable[[Path], Any], tell: Callable[[str], None]) -> dict[Path, Any]:
+    """Read files that nobody named. We leave out those that fail, and tell it."""
+    found = {}
+    for file in files:
+        try:
+            found[file] = read(file)
+        except CFlowError as error:
+            tell(f"we do not use {file.name}: {error}")
+    return found
 
 
 def _has_one_pose(path: Path) -> bool:
     try:
-        return len(read_start(path, _TESTED)) < _TESTED and len(read_poses(path).poses) == 1
-    except (CFlowError, OSError):
+        with file_errors(path):
+            return len(read_start(path, _TESTED)) < _TESTED and len(read_poses(path).poses) == 1
+    except CFlowError:
         return False
 
 
 def _start_of(path: Path, parse: Callable[[bytes, Path], Any]) -> Any:
     """Parse the first lines of a file; None = this is not possible."""
     try:
-        is_whole = path.suffix.lower() in STRUCTURED
-        start = read_start(path, _LARGEST if is_whole else _TESTED)
-        if not is_whole and len(start) == _TESTED:  # whole lines, and whole matrices of four or five
-            lines = start.splitlines(keepends=True)[:-1]
-            start = b"".join(lines[: len(lines) // 20 * 20] or lines[: len(lines) // 4 * 4])
-        return parse(start, path)
-    except (CFlowError, OSError):
+        with file_errors(path):
+            is_whole = suffix_of(path) in STRUCTURED
+            start = read_start(path, _LARGEST if is_whole else _TESTED)
+            if not is_whole and len(start) == _TESTED:  # whole lines, and whole matrices of four or five
+                lines = start.splitlines(keepends=True)[:-1]
+                start = b"".join(lines[: len(lines) // 20 * 20] or lines[: len(lines) // 4 * 4])
+            return parse(start, path)
+    except CFlowError:
         return None

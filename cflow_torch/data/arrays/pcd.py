@@ -36,12 +36,12 @@ def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
 
 
 def pcd_viewpoint(content: bytes) -> np.ndarray | None:
-    """Read VIEWPOINT, (7,) float64 x, y, z and quaternion w, x, y, z; None if it is missing or not set.
+    """Read VIEWPOINT, (7,) float64 x, y, z and quaternion w, x, y, z, as stored; None if it is missing or not set.
 
     `content` is the start of a `.pcd` file, at least its header.
     """
     numbers = np.array(_header(content)[0]["VIEWPOINT"], np.float64)
-    is_set = numbers.shape == (7,) and numbers[3:].any() and not np.array_equal(numbers, (0, 0, 0, 1, 0, 0, 0))
+    is_set = numbers.shape == (7,) and not np.array_equal(numbers, (0, 0, 0, 1, 0, 0, 0))
     return numbers if is_set else None
 
 

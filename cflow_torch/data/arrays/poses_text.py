@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from decimal import Decimal
 from pathlib import Path
-from typing import Mapping, Sequence
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.data.arrays.stamps import nanoseconds_of_dates, nanoseconds_of_numbers
+from cflow_torch.data.arrays.stamps import nanoseconds_of_numbers
 from cflow_torch.data.arrays.tables import (
-    COMMENTS,
     MATRIX,
     Table,
     as_decimals,
@@ -20,9 +19,9 @@ from cflow_torch.data.arrays.tables import (
 )
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.folders import natural_key
+from cflow_torch.data.folders import natural_key, visible
 from cflow_torch.data.npy_file import parse_npy
-from cflow_torch.data.paths import PathLike, as_path, read_bytes
+from cflow_torch.data.paths import PathLike, as_path, read_bytes, suffix_of
 from cflow_torch.data.trajectory import Trajectory, checked_poses, positions_of_degrees
 from cflow_torch.transforms import as_matrix, poses_from_quaternions, rotations_of
 from cflow_torch.types import CFlowError
@@ -32,12 +31,12 @@ _QUATERNION = ("qw", "qx", "qy", "qz")
 _ROTATIONS = {*MATRIX[0:3], *MATRIX[4:7], *MATRIX[8:11], *_QUATERNION, "q0", "q1", "q2", "q3"}  # not all are zero
 _TIMES = {"time", "sec", "nsec"}
 _TUM = ("time", *_POSITION, "qx", "qy", "qz", "qw")
-# What columns without names hold, by their number; the last row of a matrix is ignored.
-_UNNAMED = {7: _TUM[1:], 8: _TUM, 12: MATRIX, 13: ("time", *MATRIX), 16: MATRIX, 17: ("time", *MATRIX)}
+_UNNAMED = {7: _TUM[1:], 8: _TUM, 12: MATRIX[:12], 13: ("time", *MATRIX[:12]), 16: MATRIX, 17: ("time", *MATRIX)}
+"""What columns without names hold, by their number."""
 _UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four are not a quaternion; 6 have no time
 STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz", ".npy")
 """Suffixes of files that must be whole to be read, see `tables_of_values`."""
-_NAMES = "write all digits, and name the sweeps in the order of their times"
+_IN_ORDER = "write all digits, a line per sweep, in the order of their times"
 _LEAST_STEP = 0.1  # metres; shorter steps do not tell where the vehicle heads
 _INVERSE = ("extrinsic", "world2", "world_to", "w2c")  # in names of matrices that map the world to the sensor
 
@@ -68,26 +67,25 @@ def read_poses(path: PathLike) -> Trajectory:
             raise CFlowError(f"{path} is a folder: its files must have one pose each")
         return Trajectory(np.concatenate(poses), None, False, str(path), [file.stem for file in files])
     with file_errors(path):
-        content = read_bytes(path)
-    return parse_poses(content, path)
+        return parse_poses(read_bytes(path), path)
 
 
 def files_of_poses(folder: Path) -> list[Path]:
     """Return the files of a folder that may have a pose each, in order."""
-    files = [path for path in folder.iterdir() if path.suffix.lower() in (".txt", ".json", ".npy")]
+    files = [path for path in visible(folder) if suffix_of(path) in (".txt", ".json", ".npy")]
     return sorted(files, key=lambda path: natural_key(path.stem))
 
 
 def parse_poses(content: bytes, path: Path) -> Trajectory:
     """Return the poses in the content of a file of text or `STRUCTURED`."""
-    if path.suffix == ".npy":
+    if suffix_of(path) == ".npy":
         numbers = parse_npy(content, path, "pass a .npy file of (K, 4, 4) numbers")
         if numbers.shape in ((3, 4), (4, 4)):  # of a folder with a file per pose
             numbers = numbers[None]
         if numbers.ndim == 2 and numbers.shape[1] in _UNNAMED and numbers.dtype.kind in "fiu":
             return _poses_of_table(Table([], numbers.astype(str), []), path)
         return Trajectory(checked_poses(numbers, str(path)), None, False, str(path))
-    if path.suffix.lower() not in STRUCTURED:
+    if suffix_of(path) not in STRUCTURED:
         return _poses_of_table(parse_table(content, path), path)
     error = CFlowError(f"{path} has no list of poses: matrices of 16 or 12 numbers, or positions and rotations")
     for table in tables_of_values(content, path):
@@ -126,8 +124,6 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
         unnamed = _UNNAMED_ANGLES[7 - words.shape[1] :]
     if words.shape[1] == 3 and not names and _end_in_headings(words):
         unnamed = ("x", "y", "yaw")
-    if words.shape[1] in (16, 17) and not names:
-        words = _by_rows(words)
     if not roles and (not names or len(unnamed) > 8 or len(names) == len(_TUM)):
         roles = {role: column for column, role in enumerate(unnamed)}
     if not roles:
@@ -137,15 +133,17 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
         )
     numbers = words.astype(np.float64)
     rotation = [column for role, column in roles.items() if role in _ROTATIONS]
-    is_known = np.isfinite(numbers).all(axis=1)
-    is_known &= not rotation or (numbers[:, rotation] != 0).any(axis=1)  # programs write zeros for lost poses
+    is_known: Any = np.isfinite(numbers[:, list(roles.values())]).all(axis=1)
+    if rotation:  # programs write zeros for lost poses
+        is_known &= (numbers[:, rotation] != 0).any(axis=1)
     if not is_known.any():
-        raise CFlowError(f"{path} has no line of finite numbers")
+        raise CFlowError(f"{path} has no pose of finite numbers and a rotation that is not 0")
     if not _TIMES.isdisjoint(roles):  # programs write a line twice; without times, lines repeat if the vehicle stands
-        words = words[is_known]
-        words = words[np.argsort(_nanoseconds(roles, words), kind="stable")]
-        words = words[np.concatenate([[True], (words[1:] != words[:-1]).any(axis=1)])]
-        is_known = np.ones(len(words), bool)
+        rows = np.flatnonzero(is_known)
+        rows = rows[np.argsort(_nanoseconds(roles, words[rows]), kind="stable")]
+        rows = rows[np.concatenate([[True], (words[rows[1:]] != words[rows[:-1]]).any(axis=1)])]
+        words, is_known = words[rows], is_known[rows]
+        labels = [labels[row] for row in rows] if labels else []
     poses = np.full((len(words), 4, 4), np.nan)
     poses[is_known] = _poses_of_columns(names, roles, words[is_known], path)
     is_kitti = MATRIX[0] in roles and not names and words.shape[1] in (12, 13)
@@ -178,15 +176,6 @@ def _end_in_headings(words: np.ndarray) -> bool:
     return len(moved) > 0 and bool(np.median(ahead) > 0.9)
 
 
-def _by_rows(words: np.ndarray) -> np.ndarray:
-    """Return rows that end in matrices, (K, 16) or (K, 17), by rows, also if they are by columns."""
-    matrices = words[:, -16:].reshape(-1, 4, 4)
-    numbers = matrices.astype(np.float64)
-    if (numbers[:, :3, 3] != 0).any() or not (numbers[:, 3, :3] != 0).any():
-        return words
-    return np.concatenate([words[:, :-16], matrices.transpose(0, 2, 1).reshape(-1, 16)], axis=1)
-
-
 def _roles(names: Sequence[str]) -> dict[str, int]:
     """Return the columns of the position, rotation and time that names tell; {} = they do not tell a pose."""
     first: dict[str, int] = {}
@@ -209,7 +198,10 @@ def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.
     values = {role: words[:, column].astype(np.float64) for role, column in roles.items() if role not in _TIMES}
     zeros = np.zeros(len(words))
     if MATRIX[0] in roles:
-        poses = checked_poses(np.stack([values[name] for name in MATRIX], axis=1).reshape(-1, 3, 4), str(path))
+        matrices = np.stack([values[name] for name in MATRIX if name in values], axis=1).reshape(len(words), -1, 4)
+        if matrices.shape[1] == 4 and not matrices[:, :3, 3].any() and matrices[:, 3, :3].any():
+            matrices = matrices.transpose(0, 2, 1)  # by columns
+        poses = checked_poses(matrices[:, :3], str(path))
         is_inverse = bool(names) and any(each in names[roles[MATRIX[0]]].lower() for each in _INVERSE)
         return np.linalg.inv(poses) if is_inverse else poses
     if "x" not in values:
@@ -231,35 +223,32 @@ def _nanoseconds(roles: Mapping[str, int], words: np.ndarray) -> np.ndarray:
     """Return the times of poses, (K,) int64 nanoseconds."""
     if {"sec", "nsec"} <= set(roles):
         pairs = words[:, [roles["sec"], roles["nsec"]]].tolist()
-        return np.array([int(second) * 10**9 + int(rest) for second, rest in pairs], np.int64)
+        return np.array([int(Decimal(second) * 10**9 + Decimal(rest)) for second, rest in pairs], np.int64)
     return np.array(nanoseconds_of_numbers(words[:, roles["time"]].tolist()), np.int64)
 
 
-def read_times(path: PathLike) -> np.ndarray:
+def read_times(path: PathLike, is_sorted: bool = True) -> np.ndarray:
     """Read a file with one ascending time per line (KITTI's `times.txt`) as (K,) int64 nanoseconds.
 
-    Times are seconds, unix times in s, ms, us or ns, or dates (2011-09-26 13:02:25.594360375).
+    Times are seconds, unix times in s, ms, us or ns, or dates (2011-09-26 13:02:25.594360375). If they need not be
+    sorted, pass False.
     """
     path = as_path(path)
-    with file_errors(path):
-        content = read_bytes(path)
-    return parse_times(content, path)
+    with file_errors(path, _IN_ORDER):
+        return parse_times(read_bytes(path), path, is_sorted)
 
 
-def parse_times(content: bytes, path: Path) -> np.ndarray:
-    with file_errors(path):
-        lines = [line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()]
-        lines = [line for line in lines if not line.startswith(COMMENTS)]
-    dates = nanoseconds_of_dates(lines)
-    if dates:
-        return _ascending(path, np.array(dates, np.int64))
-    words = parse_table(content, path).words
-    if words.shape[1] != 1:
-        raise CFlowError(f"{path} must have one time in seconds per line")
-    return _ascending(path, np.array(nanoseconds_of_numbers(words[:, 0].tolist()), np.int64))
+def parse_times(content: bytes, path: Path, is_sorted: bool = True) -> np.ndarray:
+    names, words, _ = parse_table(content, path)
+    columns = [column for column, name in enumerate(names) if role_of_name(name) == "time"]
+    if words.shape[1] > 1 and not columns:
+        raise CFlowError(f"{path} must have one time per line, or a column called time")
+    words = words[:, columns[0] if columns else 0]
+    times: np.ndarray = np.array(nanoseconds_of_numbers(words.tolist()), np.int64)
+    return _ascending(path, times, _IN_ORDER) if is_sorted else times
 
 
-def _ascending(path: Path, times: np.ndarray, fix: str = _NAMES) -> np.ndarray:
+def _ascending(path: Path, times: np.ndarray, fix: str) -> np.ndarray:
     """Return (K,) int64 nanoseconds, which must ascend; `fix` says how to correct those that do not."""
     falls = np.diff(times) <= 0
     if falls.any():

@@ -11,7 +11,7 @@ import numpy as np
 
 from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
-from cflow_torch.data.arrays.cloud_file import in_single, read_columns, read_table, small_arrays, stem_of, suffix_of
+from cflow_torch.data.arrays.cloud_file import in_single, read_columns, read_table, small_arrays
 from cflow_torch.data.arrays.folder import (
     GROUND_FOLDER,
     POSE_FILES,
@@ -20,6 +20,7 @@ from cflow_torch.data.arrays.folder import (
     find_tables,
     only_one,
     other_folders,
+    read_all,
     resolve,
 )
 from cflow_torch.data.arrays.pcd import LONGEST_HEADER, pcd_viewpoint
@@ -29,7 +30,7 @@ from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
-from cflow_torch.data.paths import PathLike, as_path, is_path_like, read_bytes, read_start
+from cflow_torch.data.paths import PathLike, as_path, is_path_like, read_bytes, read_start, stem_of, suffix_of
 from cflow_torch.data.point_times import find_times
 from cflow_torch.data.trajectory import Trajectory, checked_poses, fit_to_sweeps
 from cflow_torch.transforms import poses_from_quaternions, rigid_transform, transform_points
@@ -113,8 +114,7 @@ class ArraysLog(Log):
         trajectory, are_of_lidar = self._trajectory(poses, calibration)
         stamps = self._times(times, trajectory)
         if trajectory is None and poses == "auto" and stamps is not None:
-            trajectory, note = find_poses_near(self.folder, stamps)
-            self._note(note)
+            trajectory = find_poses_near(self.folder, stamps, self._note)
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
         if trajectory is not None and (are_of_lidar or poses_of == "lidar"):
@@ -181,7 +181,7 @@ class ArraysLog(Log):
             found = [
                 path
                 for path in find_tables(self.folder, self.files)[0]
-                if path.suffix.lower() not in poses_text.STRUCTURED or self._fits(path)
+                if suffix_of(path) not in poses_text.STRUCTURED or self._fits(path)
             ]
             file = only_one(found, self.folder, "poses")
             self._note(f"its poses are those of {file.name}" if file else "")
@@ -219,9 +219,12 @@ class ArraysLog(Log):
             with file_errors(file):
                 viewpoint = pcd_viewpoint(read_start(file, LONGEST_HEADER))
             row[:] = row if viewpoint is None else viewpoint
-        if (numbers == np.eye(7)[3]).all():
+        known = np.flatnonzero(np.isfinite(numbers).all(axis=1) & numbers[:, 3:].any(axis=1))
+        if (numbers[known] == np.eye(7)[3]).all():
             return None
-        poses = poses_from_quaternions(numbers[:, :3], numbers[:, 3:], lambda k: f"{self.files[k]}: VIEWPOINT")
+        what = f"VIEWPOINT of {self.folder}, of its poses number"
+        poses = np.full((len(numbers), 4, 4), np.nan)
+        poses[known] = poses_from_quaternions(numbers[known, :3], numbers[known, 3:], lambda k: f"{what} {k}")
         return Trajectory(poses, None, False, _VIEWPOINT)
 
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
@@ -241,9 +244,10 @@ class ArraysLog(Log):
         if times_ns is not None and len(times_ns) == count:
             return times_ns.tolist()  # type: ignore[no-any-return]
         tables = find_tables(self.folder, self.files)[1] if times == "auto" else []
-        file = only_one([table for table in tables if len(poses_text.read_times(table)) == count], self.folder, "times")
+        read = read_all(tables, poses_text.read_times, self._note)
+        file = only_one([table for table, times in read.items() if len(times) == count], self.folder, "times")
         self._note(f"the times of its sweeps are those of {file.name}" if file else "")
-        return None if file is None else poses_text.read_times(file).tolist()
+        return None if file is None else read[file].tolist()
 
     def _labelled_rows(self, labels: Sequence[str]) -> np.ndarray | None:
         """Return the row of each file in a table whose rows have labels: by its name, its number, or in their order.
@@ -341,7 +345,7 @@ def _number_of(stem: str) -> int:
 def _drives_along_x(poses: np.ndarray) -> bool:
     """Test whether poses (K, 4, 4) move along their own x axis more than along y and z."""
     steps = np.linalg.inv(poses[:-1]) @ poses[1:]
-    along = np.abs(steps[:, :3, 3]).sum(axis=0)
+    along = np.nansum(np.abs(steps[:, :3, 3]), axis=0)  # unknown poses are NaN
     return bool(along[0] > along[1] + along[2])
 
 

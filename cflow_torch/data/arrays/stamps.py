@@ -7,10 +7,15 @@ from datetime import datetime, timezone
 from decimal import Decimal
 from typing import Sequence
 
-_UNITS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6))  # sizes of unix times, and the ns of their unit; else seconds
-_STEPS = ((5 * 10**6, 1), (5 * 10**3, 10**3), (5, 10**6))  # the same, by the step from one time to the next
-_FIRST_UNIX = 10**9  # seconds; smaller times have another start
-_DATE = re.compile(r"(?<!\d)(\d{4})\D?(\d\d)\D?(\d\d)\D(\d\d)\D?(\d\d)\D?(\d\d)(?:\D(\d+))?")
+_UNITS = (1, 10**3, 10**6, 10**9)  # nanoseconds in ns, us, ms and s
+_SHORTEST = 1_200_000  # nanoseconds from one time to the next, which tell the unit
+_LONGEST = 10**11  # the same, of unix times
+_UNIX = range(10**18, 41 * 10**17)  # nanoseconds since 1970: from 2001 to 2099
+# After colons, "-08:00" and "-0800" are a time zone, else "-123456" is a fraction.
+_DATE = re.compile(
+    r"(?<!\d)(\d{4})\D?(\d\d)\D?(\d\d)\D(\d\d)\D?(\d\d)\D?(\d\d)"
+    r"(?:(?:[._]|(?<!:\d\d)[^\d+])(\d+)(?![\d:]))?(?:([+-])(\d\d):?(\d\d)(?!\d))?"
+)
 _CLOCK = re.compile(r"(?<![\d:])(\d\d?):(\d\d):(\d\d)(?:[.,](\d+))?(?![\d:])")
 _STAMP = re.compile(r"(?<!\d)([1-9]\d{12}|[1-9]\d{15,17}|[1-8]\d{18})(?!\d)")  # no numbers with zeros in front
 # Seconds and a fraction: unix seconds anywhere in a name, or the only number of a name.
@@ -21,23 +26,24 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 def nanoseconds_of_numbers(words: Sequence[str]) -> list[int]:
     """Convert texts of times to nanoseconds exactly: unix times need 19 digits, a float has 16.
 
-    They may be in s, ms, us or ns: the largest tells the unit of unix times, and the median step that of others.
+    They may be in s, ms, us or ns. The unit is the one in which they are unix times with a median step of at most
+    100 s. Times from another start have the smallest unit in which the step is at least 1.2 ms.
     """
     numbers = [Decimal(word) for word in words]
-    largest = max(map(abs, numbers))
-    unit = next((unit for first, unit in _UNITS if largest >= first), None)
-    if unit is None:  # times from another start than 1970, or unix seconds
-        steps = sorted(after - before for before, after in zip(numbers, numbers[1:])) or [Decimal(0)]
-        unit = next((unit for first, unit in _STEPS if steps[len(steps) // 2] >= first), 10**9)
-        unit = 10**9 if largest >= _FIRST_UNIX and unit == 10**6 else unit  # poses may be seconds apart
+    distinct = sorted(set(numbers))
+    steps = sorted(after - before for before, after in zip(distinct, distinct[1:])) or [Decimal(0)]
+    step = steps[len(steps) // 2]
+    units = [unit for unit in _UNITS if int(distinct[-1] * unit) in _UNIX and step * unit <= _LONGEST]
+    units += [unit for unit in _UNITS if step * unit >= _SHORTEST]
+    unit = next(iter(units), 10**9)
     return [int((number * unit).to_integral_value()) for number in numbers]
 
 
 def nanoseconds_of_dates(texts: Sequence[str]) -> list[int] | None:
     """Convert texts that contain a date such as 2011-09-26 13:02:25.594360375 to nanoseconds since 1970 (UTC).
 
-    Year to second have all digits, with one separator or none. Of a time without a date (13:02:25.594), we return the
-    nanoseconds since midnight. None = a text contains neither.
+    Year to second have all digits, with one separator or none, and may have a time zone behind. Of a time without a
+    date (13:02:25.594), we return the nanoseconds since midnight. None = a text contains neither.
     """
     times = []
     for text in texts:
@@ -45,12 +51,14 @@ def nanoseconds_of_dates(texts: Sequence[str]) -> list[int] | None:
         clock = _CLOCK.search(text) if date is None else None
         if date is None and clock is None:
             return None
-        *numbers, fraction = date.groups() if date else (1970, 1, 1, *clock.groups())  # type: ignore[union-attr]
+        *numbers, fraction = date.groups()[:7] if date else (1970, 1, 1, *clock.groups())  # type: ignore[union-attr]
         try:
             time = datetime(*map(int, numbers), tzinfo=timezone.utc)  # type: ignore[arg-type,misc]
         except ValueError:
             return None
-        times.append(int((time - _EPOCH).total_seconds()) * 10**9 + int((fraction or "0")[:9].ljust(9, "0")))
+        sign, hours, minutes = date.groups()[7:] if date and date[8] else ("+", 0, 0)
+        east = int(f"{sign}{60 * int(hours) + int(minutes)}") * 60
+        times.append((int((time - _EPOCH).total_seconds()) - east) * 10**9 + int((fraction or "0")[:9].ljust(9, "0")))
     return times
 
 
@@ -60,11 +68,12 @@ def times_of_names(names: Sequence[str]) -> list[int] | None:
     Names contain a unix time in milliseconds (13 digits), microseconds (16, 17) or nanoseconds (18, 19), unix seconds
     and a fraction ("1700000000.05", "1700000000_050000000"), or a date; or their only number is seconds ("0.05").
     Fractions are decimals, unless their numbers of digits differ and the longest has nine: then they are nanoseconds
-    without leading zeros.
+    without leading zeros. A last number that counts the files is ignored.
     """
     times = None
     if not names:
         return None
+    names = _without_counters(names)
     stamps = [_STAMP.search(name) for name in names]
     seconds = [[pattern.search(name) for name in names] for pattern in _SECONDS]
     if all(stamps):
@@ -74,6 +83,16 @@ def times_of_names(names: Sequence[str]) -> list[int] | None:
             times = _with_fractions([(match[1], match[2]) for match in matches if match])
     times = times or nanoseconds_of_dates(names)
     return times if times is not None and len(set(times)) == len(times) else None
+
+
+def _without_counters(names: Sequence[str]) -> Sequence[str]:
+    """Cut off the last number if it has three digits or more in all names, always grows, and mostly by less than 10."""
+    last = [match for match in (re.search(r"(\d{3,})\D*$", name) for name in names) if match]
+    numbers = [int(match[1]) for match in last]
+    steps = sorted(after - before for before, after in zip(numbers, numbers[1:]))
+    are_alike = len(last) == len(names) > 1 == len({len(match[1]) for match in last})
+    is_counter = are_alike and steps[0] > 0 and steps[len(steps) // 2] < 10
+    return [name[: match.start()] for name, match in zip(names, last)] if is_counter else names
 
 
 def _with_fractions(pairs: Sequence[tuple[str, str]]) -> list[int]:

@@ -17,18 +17,15 @@ from cflow_torch.data.arrays.stamps import nanoseconds_of_dates
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
-from cflow_torch.data.paths import read_bytes
+from cflow_torch.data.paths import read_bytes, suffix_of
 
 _FEWEST_NUMBERS = 7  # of a pose
 COMMENTS = ("#", "%", "//")
 """Beginnings of lines that are no rows."""
-MATRIX = tuple(f"m{k}" for k in range(12))
-"""Names of the entries of the upper three rows of a matrix, row by row."""
-_VECTORS = {  # numbers in a list of a JSON file, and a role that the name of the list has -> endings of their names
-    (3, "x"): (".x", ".y", ".z"),
-    (4, "qx"): (".0", ".1", ".2", ".3"),
-    (3, "qx"): (".roll", ".pitch", ".yaw"),
-}
+MATRIX = tuple(f"m{k}" for k in range(16))
+"""Names of the entries of a matrix, row by row or column by column; the last four may be missing."""
+# Numbers in a list of a JSON file, and the role that the name of the list has -> endings of their names, else 0, 1, ...
+_VECTORS: dict[Any, Sequence[Any]] = {(3, "x"): ("x", "y", "z"), (3, "qx"): ("roll", "pitch", "yaw")}
 
 
 class Table(NamedTuple):
@@ -42,35 +39,64 @@ class Table(NamedTuple):
 def parse_table(content: bytes, path: Path) -> Table:
     """Read the table in a text file.
 
-    Names are those of the last line before the numbers, also if it is a comment (`COMMENTS`). They are empty if this
-    line does not have one name for each column. Columns of dates become seconds. Other columns of texts are left out;
-    one of distinct texts names the rows.
+    Names are those that `start_of_rows` finds. Columns of dates become seconds, and empty words NaN. Other columns of
+    texts are left out; one of distinct texts names the rows.
     """
-    with file_errors(path, "every line must have the same number of numbers"):
-        lines = [line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()]
-        lines = _poses_only(lines)
-        plain = [line for line in lines if not line.startswith(COMMENTS)]
-        usual = len(split_line(plain[len(plain) // 2])) if plain else 0
-        start = next((k for k, line in enumerate(lines) if _is_row(split_line(line), usual)), len(lines))
-        header = lines[start - 1].lstrip("#%/") if start else ""
-        names = re.split("[,;]", header) if re.search("[,;]", header) else header.split()
+    with file_errors(path, "every line must have the same number of numbers, in UTF-8"):
+        lines = _poses_only([line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()])
+        start, names = start_of_rows(lines, _FEWEST_NUMBERS)
         rows = [split_line(line) for line in lines[start:] if not line.startswith(COMMENTS)]
-        has_text = not all(line.startswith(COMMENTS) for line in lines[: max(start - 1, 0)])
-        if has_text or len(set(map(len, rows))) != 1:
+        texts = [line for line in lines[:start] if _has_letters(line) and not line.startswith(COMMENTS)]
+        width = min(map(len, rows), default=0)
+        is_uneven = any(any(row[width:]) for row in rows)  # a line may lack the comma at the end of others
+        if not rows or is_uneven or (len(texts) > 1 and not names):
             raise ValueError("it is empty, or has text before its numbers" if start else "its lines differ in length")
-        words = np.array(list(map(_seconds_of_dates, zip(*rows))), str).T
-        columns = [column for column, word in enumerate(words[0]) if is_number(word)]
-        texts = [words[:, column].tolist() for column in range(words.shape[1]) if column not in columns]
-        labels: list[str] = next((column for column in texts if len(set(column)) == len(column)), [])
-        names = [names[column] for column in columns] if len(names) == words.shape[1] else []
-        words = words[:, columns]
+        columns = list(map(_seconds_of_dates, zip(*rows)))
+        kept = [k for k, column in enumerate(columns) if is_number(next(filter(None, column), ""))]
+        others = [list(column) for k, column in enumerate(columns) if k not in kept]
+        labels: list[str] = next((column for column in others if len(set(column)) == len(column)), [])
+        if not kept:
+            raise ValueError("it has no numbers")
+        words = np.array([[word or "nan" for word in columns[k]] for k in kept], str).T
         words.astype(np.float64)  # raises the error
-    return Table(names, words, labels)
+    return Table([names[k] for k in kept] if names else [], words, labels)
+
+
+def start_of_rows(lines: Sequence[str], fewest: int) -> tuple[int, list[str]]:
+    """Return the index of the first row of a table, and the names of its columns.
+
+    Rows have as many words as the middle line: numbers and empty words, or texts and at least so many numbers. Names
+    are in the last line above with one for each column, also if it is a comment (`COMMENTS`); [] = there is none.
+    Lines that repeat a word, such as a unit, come last.
+    """
+    plain = [line for line in lines if line and not line.startswith(COMMENTS)]
+    width = len(split_line(plain[len(plain) // 2])) if plain else 0
+    start = next((k for k, line in enumerate(lines) if _is_row(line, width, fewest)), len(lines))
+    ends_empty = start < len(lines) and split_line(lines[start])[-1] == ""
+    found = []
+    for line in filter(_has_letters, reversed(lines[:start])):
+        header = line.lstrip("#%/ ")
+        names = re.split("[,;]" if re.search("[,;]", header) else r"\s+", header)
+        names += [""] * (ends_empty and len(names) == width - 1)  # each row ends with a comma
+        found += [[name.strip(' "') for name in names]] * (len(names) == width)
+    return start, min(found, key=lambda names: len(set(names)) < width, default=[])
+
+
+def _is_row(line: str, width: int, fewest: int) -> bool:
+    words = split_line(line)
+    count = sum(is_number(_seconds_of_dates([word])[0]) for word in words)
+    is_row = count + words.count("") == width or count >= fewest
+    return is_row and len(words) == width and not line.startswith(COMMENTS)
+
+
+def _has_letters(line: str) -> bool:
+    return re.search("[A-Za-z]", line) is not None
 
 
 def _seconds_of_dates(column: Sequence[str]) -> Sequence[str]:
     """Return a column of times of day, with or without dates, as seconds with decimals; others as they are."""
-    times = nanoseconds_of_dates(column) if ":" in column[0] else None
+    is_other = is_number(column[0]) or re.search("[a-z]", column[0])  # names of files contain dates, too
+    times = None if is_other else nanoseconds_of_dates(column)
     return column if times is None else [f"{Decimal(time).scaleb(-9):f}" for time in times]
 
 
@@ -81,8 +107,11 @@ def read_numbers(path: Path) -> np.ndarray:
 
 
 def _poses_only(lines: list[str]) -> list[str]:
-    """Leave out edges of a g2o graph, and the three numbers above each matrix of a trajectory of Open3D."""
-    vertices = [line for line in lines if line.startswith("VERTEX_SE3")]
+    """Leave out edges of a g2o graph, and the three numbers above each matrix of a trajectory of Open3D.
+
+    The id of a vertex becomes a part of its name: it may be a number of the pose, or a key, but not a time.
+    """
+    vertices = [re.sub(r"\s+", "_", line, count=1) for line in lines if line.startswith("VERTEX_SE3")]
     counts = [len(split_line(line)) for line in lines[:5]]
     return vertices or ([line for k, line in enumerate(lines) if k % 5] if counts == [3, 4, 4, 4, 4] else lines)
 
@@ -90,8 +119,8 @@ def _poses_only(lines: list[str]) -> list[str]:
 def tables_of_values(content: bytes, path: Path) -> Iterator[Table]:
     """Yield what may be a table in a JSON, YAML or .npz file: lists, and objects whose members are alike, outer first.
 
-    Numbers of a row are named by their keys, joined by dots. A list, nested or not, of 12 or 16 numbers is a matrix, by
-    rows, or by columns if these end in 0, 0, 0, 1. A list of three or four is a vector if the name of the list says so.
+    Numbers of a row are named by their keys, joined by dots. A list, nested or not, of 12 or 16 numbers is a matrix. A
+    list of three or four is a vector if the name of the list says so.
     """
     value = _value_of(content, path)
     for labels, members in (*_series(value), ([], [value])):
@@ -113,7 +142,7 @@ def table_of(members: Sequence[Any], labels: Sequence[str] = ()) -> Table | None
 
 def _value_of(content: bytes, path: Path) -> Any:
     """Return the lists, dictionaries and Decimals in a file. Nothing is unpickled."""
-    kind = path.suffix.lower()
+    kind = suffix_of(path)
     with file_errors(f"{path} as {kind[1:]}"):
         if kind == ".npz":
             with np.load(io.BytesIO(content), allow_pickle=False) as archive:
@@ -165,25 +194,14 @@ def _numbers(value: Any) -> list[Decimal]:
 
 
 def _numbers_of(value: Any, name: str) -> Iterator[tuple[str, str]]:
-    """Yield the names and numbers of a row, see `tables_of_json`."""
+    """Yield the names and numbers of a row, see `tables_of_values`."""
     numbers = _numbers(value)
     if isinstance(value, Decimal):
         yield name, str(value)
-    elif len(numbers) in (12, 16):
-        matrix = np.array(numbers).reshape(-1, 4)
-        is_by_columns = len(matrix) == 4 and matrix[:, 3].tolist() == [0, 0, 0, 1] != matrix[3].tolist()
-        prefix = f"{name}." if name else ""
-        yield from zip(
-            [prefix + each for each in MATRIX], map(str, (matrix.T if is_by_columns else matrix)[:3].ravel())
-        )
     elif numbers:
-        fitting = [
-            ends
-            for (count, role), ends in _VECTORS.items()
-            if count == len(numbers) and role_of_name(f"{name}.x") == role
-        ]
-        ends = fitting[0] if fitting else [f".{k}" for k in range(len(numbers))]
-        yield from ((name + end, str(number)) for end, number in zip(ends, numbers))
+        kind = len(numbers), role_of_name(f"{name}.x")
+        ends = MATRIX if len(numbers) in (12, 16) else _VECTORS.get(kind, range(len(numbers)))
+        yield from ((f"{name}.{end}".lstrip("."), str(number)) for end, number in zip(ends, numbers))
     elif isinstance(value, dict):
         for key, member in value.items():
             yield from _numbers_of(member, f"{name}.{key}" if name else key)
@@ -195,16 +213,18 @@ def _text_of(value: Any) -> str:
 
 
 def split_line(line: str) -> list[str]:
+    """Return the words between commas or semicolons, of which some are empty, or between blanks.
+
+    Between commas, only numbers are split at blanks.
+    """
     decimal = line.replace(",", ".") if ";" in line else line  # as some languages write numbers
-    decimal = re.sub(r"[\[\]]", " ", decimal).strip()  # as NumPy prints matrices
-    decimal = re.sub(r"(\d[-/.]\d\d) (?=\d\d:)", r"\1T", decimal)  # a date and its time are one word
-    return re.split(r"[\s,;]+", decimal.rstrip(",; "))
-
-
-def _is_row(words: Sequence[str], usual: int) -> bool:
-    """Test whether words are as many as usual in a table, and a row of numbers, or a pose with a few texts."""
-    num_numbers = sum(map(is_number, words))
-    return len(words) == usual and (num_numbers == len(words) or num_numbers >= _FEWEST_NUMBERS)
+    plain = re.sub(r"(\d[-/.]\d\d) (?=\d\d:)", r"\1T", decimal.replace('"', ""))  # a date and its time are one word
+    if "[" in plain or "]" in plain:  # as NumPy prints matrices
+        return re.split(r"[\s,;\[\]]+", plain.strip(" \t,;[]"))
+    cells = re.split(r"\s*[,;]\s*", plain.strip())
+    pieces = [cell.split() for cell in cells]
+    are_split = [len(cells) == 1 or (len(each) > 1 and all(map(is_number, each))) for each in pieces]
+    return [word for cell, each, is_split in zip(cells, pieces, are_split) for word in (each if is_split else [cell])]
 
 
 def is_number(word: str) -> bool:
@@ -212,4 +232,4 @@ def is_number(word: str) -> bool:
         float(word)
     except ValueError:
         return False
-    return True
+    return "_" not in word  # which Python allows

@@ -20,8 +20,7 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 def cloud_columns(message: Any) -> dict[str, np.ndarray]:
     """Return the fields of a PointCloud2 or of Livox' CustomMsg, x, y, z and others: name -> (N,) numbers as stored.
 
-    We leave out `missing_returns`. A cloud without x, y or
-    z, or with less data than it states, is a ValueError.
+    We leave out `missing_returns`. A cloud without x, y or z, or with less data than it states, is a ValueError.
     """
     if hasattr(message, "points"):
         return _livox_columns(message)
@@ -34,21 +33,25 @@ def cloud_columns(message: Any) -> dict[str, np.ndarray]:
     row_step = message.row_step or message.width * step
     rows = np.frombuffer(message.data, np.uint8, message.height * row_step).reshape(message.height, row_step)
     octets = np.ascontiguousarray(rows[:, : message.width * step])
+    tables = []
     for order in "><" if message.is_bigendian else "<>":  # some drivers state the wrong order
         kinds = [order + _TYPES[fields[name].datatype] for name in names]
         kind = np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": step})
-        table = octets.view(kind).reshape(-1)
-        points = np.stack([table[axis] for axis in "xyz"], axis=1)
-        if are_plausible(points):
-            break
-    table = table[~missing_returns(points)]
+        tables.append(octets.view(kind).reshape(-1))
+    table = next((table for table in tables if are_plausible(points_of(table))), tables[0])
+    table = table[~missing_returns(points_of(table))]
     return {name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in names}
+
+
+def points_of(columns: Any) -> np.ndarray:
+    """Return (N, 3) points in the frame of the cloud."""
+    return np.stack([columns[axis] for axis in "xyz"], axis=1)
 
 
 def _livox_columns(message: Any) -> dict[str, np.ndarray]:
     kinds = {"x": "f4", "y": "f4", "z": "f4", "offset_time": "u4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
     columns = {name: np.array([getattr(p, name) for p in message.points], kind) for name, kind in kinds.items()}
-    kept = ~missing_returns(np.stack([columns[axis] for axis in "xyz"], axis=1))
+    kept = ~missing_returns(points_of(columns))
     return {name: values[kept] for name, values in columns.items()}
 
 
@@ -56,15 +59,26 @@ Sample = Tuple[float, ...]  # nanoseconds (int), x, y, z, and the quaternion w, 
 
 
 class Frames:
-    """A tree of coordinate frames: the parent of each frame, and samples of its `T_parent_frame` over time."""
+    """A tree of coordinate frames: the parent of each frame, and samples of its `T_parent_frame` over time.
 
-    def __init__(self, parents: dict[str, str], samples: dict[str, list[Sample]]) -> None:
-        self._parents = parents
-        # If all samples of a transform are equal, it is fixed, and we keep one of them.
-        self._links = {
-            child: sorted_poses(rows if len({row[1:] for row in rows}) > 1 else rows[:1], f"the transform to {child}")
-            for child, rows in samples.items()
-        }
+    `samples` are those of each parent and frame. Of several parents of a frame, we take the one with the most samples.
+    Ties: the last.
+    """
+
+    def __init__(self, samples: dict[tuple[str, str], list[Sample]]) -> None:
+        by_count = sorted(samples, key=lambda link: len(samples[link]))
+        self._parents = {child: parent for parent, child in by_count}
+        self._ignored = [(parent, child) for parent, child in by_count if self._parents[child] != parent]
+        self._samples = {child: samples[parent, child] for child, parent in self._parents.items()}
+        self._links: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+
+    def _link(self, child: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the times and poses of the transform to a frame; one of each if all its samples are equal."""
+        if child not in self._links:
+            rows = self._samples[child]
+            is_fixed = len({row[1:] for row in rows}) == 1
+            self._links[child] = sorted_poses(rows[:1] if is_fixed else rows, f"the transform to {child}")
+        return self._links[child]
 
     def chain(self, frame: str) -> list[str]:
         """Return the frame, its parent, ... up to the root."""
@@ -73,12 +87,17 @@ class Frames:
             chain.append(self._parents[chain[-1]])
         return chain
 
+    def ignored(self, *frames: str) -> str:
+        """Name the transforms to other parents of frames, or of those above them."""
+        used = {each for frame in frames for each in self.chain(frame)}
+        return ", ".join(f"{parent} to {child}" for parent, child in self._ignored if child in used)
+
     def are_joined(self, frame: str, other: str) -> bool:
         return self.chain(frame)[-1] == self.chain(other)[-1]
 
     def change_times(self, frame: str) -> np.ndarray:
         """Return the sample times of all moving transforms between the root and a frame, (K,) int64 ns, ascending."""
-        times = [self._links[child][0] for child in self.chain(frame)[:-1]]
+        times = [self._link(child)[0] for child in self.chain(frame)[:-1]]
         return np.unique(np.concatenate([np.zeros(0, np.int64), *(t for t in times if len(t) > 1)]))
 
     def in_root(self, frame: str, times_ns: np.ndarray) -> np.ndarray:
@@ -88,14 +107,14 @@ class Frames:
         """
         result = np.tile(np.eye(4), (len(times_ns), 1, 1))
         for child in self.chain(frame)[:-1]:
-            times, poses = self._links[child]
+            times, poses = self._link(child)
             at = poses_at(np.clip(times_ns, times[0], times[-1]), times, poses) if len(times) > 1 else poses
             result = at @ result
         return result
 
     def is_moving(self, child: str) -> bool:
         """Test whether the transform from the parent of a frame to the frame changes."""
-        return child in self._links and len(self._links[child][0]) > 1
+        return child in self._samples and len(self._link(child)[0]) > 1
 
     def world_of(self, frame: str) -> str:
         """Return the frame in which the path of a frame is continuous: its root, or the one below corrections.
@@ -104,7 +123,7 @@ class Frames:
         """
         moving = [child for child in self.chain(frame)[:-1] if self.is_moving(child)]
         for child in moving[1:]:
-            poses = self._links[child][1]
+            poses = self._link(child)[1]
             is_constant = np.abs(np.diff(poses, axis=0)).max(axis=(1, 2)) < _CONSTANT
             if child.split("/")[-1] == "odom" or is_constant.mean() > 0.5:
                 return child

@@ -12,7 +12,7 @@ import numpy as np
 
 from cflow_torch.data.arrays.folder import find_poses_near
 from cflow_torch.data.arrays.poses_text import read_poses
-from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, is_pose, sample, sorted_poses
+from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, is_pose, points_of, sample, sorted_poses
 from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import search
 from cflow_torch.data.log import Log
@@ -29,6 +29,10 @@ _PART = re.compile("(.+)_([0-9]+)")  # recorders number the parts of a bag from 
 SEARCH_DEPTH = 3
 _CLOUD = "sensor_msgs/msg/PointCloud2"
 _LIVOX = tuple(f"{name}/msg/CustomMsg" for name in ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces"))
+_CUSTOM_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line"
+_CUSTOM_MSG = (
+    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points"
+)
 # Messages that hold clouds which we do not decode, and what converts them to PointCloud2.
 _CONVERTERS = {
     "CompressedPointCloud2": "point_cloud_transport's republish, or cloudini_rosbag_converter",
@@ -150,8 +154,7 @@ class BagLog(Log):
         """Return the poses of the file that is named, of the bag or, with "auto", of a file near the bag."""
         trajectory = self._poses_of_file(poses) or self._poses_of_bag(topics, poses, tracks)
         if trajectory is None and poses == "auto":
-            trajectory, note = find_poses_near(self.path.parent, self.timestamps)
-            self._note(note)
+            trajectory = find_poses_near(self.path.parent, self.timestamps, self._note)
         return trajectory
 
     def _poses_of_bag(self, topics: dict[str, str], poses: str | None, tracks: dict[str, Any]) -> Trajectory | None:
@@ -188,7 +191,7 @@ class BagLog(Log):
     def sweep(self, index: int) -> Sweep:
         time = self._timestamp(index)
         columns, times = self._timed_cloud(time)
-        points = transform_points(_points(columns), self._mount_at(time))
+        points = transform_points(points_of(columns), self._mount_at(time))
         pose = None if self.poses is None else self.poses[index].copy()
         return Sweep(points.astype(np.float32), None, pose, time, times)
 
@@ -200,7 +203,7 @@ class BagLog(Log):
     def _timed_cloud(self, time: int) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Read a cloud and the (N,) seconds of its points; None = unknown. We leave out points of stray times."""
         columns = self._cloud(time)
-        times = find_times(columns, time - self._shift, self._period, _points(columns), self._note)
+        times = find_times(columns, time - self._shift, self._period, points_of(columns), self._note)
         if times is None or times.seconds is None:
             return columns, None
         kept = ~times.is_stray
@@ -216,6 +219,9 @@ class BagLog(Log):
             _check_version(self._files)
             # Bags of ROS 2 before Iron do not describe their messages. The types that we read never changed.
             types_of_old_bags = types.get_typestore(types.Stores.ROS2_HUMBLE)
+            for name in _LIVOX:
+                for kind, definition in (("CustomPoint", _CUSTOM_POINT), ("CustomMsg", _CUSTOM_MSG)):
+                    types_of_old_bags.register(types.get_types_from_msg(definition, name.replace("CustomMsg", kind)))
             reader = rosbags.AnyReader(self._files, default_typestore=types_of_old_bags)
             reader.open()
             self._opened = (os.getpid(), reader)
@@ -279,8 +285,7 @@ class BagLog(Log):
         self._child: dict[str, str] = {}
         self._pose_delays: list[int] = []  # nanoseconds from the times of poses and transforms to their arrival
         stamps: list[tuple[int, int]] = []  # of each cloud: its header's, and its arrival
-        parents: dict[str, str] = {}
-        links: dict[str, list[Any]] = {}
+        links: dict[tuple[str, str], list[Sample]] = {}
         tracks: dict[str, list[Any]] = {}
         reader = self._reader()
         types = (*_POSE_TYPES, *_OTHER_POSES, *_TF_TYPES)
@@ -295,25 +300,25 @@ class BagLog(Log):
                 else:
                     self._note(f"its clouds are of several sensors: we read those in {self._lidar}, not in {frame}")
             elif connection.msgtype in _TF_TYPES:
-                self._add_transforms(message, arrived, parents, links)
+                self._add_transforms(message, arrived, links)
             else:
                 self._add_poses(connection.topic, message, arrived, tracks)
-        self._frames = Frames(parents, links)
+        self._frames = Frames(links)
+        ignored = self._frames.ignored(self._lidar, _BASE)
+        self._note(
+            f"frames have several parents: we ignore the transforms that are rarer, {ignored}" if ignored else ""
+        )
         return self._arrivals(stamps), tracks
 
-    def _add_transforms(
-        self, message: Any, arrived: int, parents: dict[str, str], links: dict[str, list[Sample]]
-    ) -> None:
-        """Add the transforms of a message to the parents and the samples of each frame."""
+    def _add_transforms(self, message: Any, arrived: int, links: dict[tuple[str, str], list[Sample]]) -> None:
+        """Add the transforms of a message to the samples of each parent and frame."""
         for link in message.transforms:
             pose = _pose_of(link, arrived)
             if not is_pose(pose):
                 self._note(_LOST.format("transforms"))
                 continue
             self._pose_delays.append(arrived - _stamp(link, arrived))
-            child = link.child_frame_id.lstrip("/")
-            parents[child] = _frame_of(link)
-            links.setdefault(child, []).append(pose)
+            links.setdefault((_frame_of(link), link.child_frame_id.lstrip("/")), []).append(pose)
 
     def _add_poses(self, topic: str, message: Any, arrived: int, tracks: dict[str, list[Sample]]) -> None:
         """Add the poses of a message to those of its topic."""
@@ -413,11 +418,6 @@ def _name_of(path: Path, has_parts: bool) -> str:
 
 def _middle(values: list[int]) -> int:
     return sorted(values)[len(values) // 2] if values else 0
-
-
-def _points(columns: dict[str, np.ndarray]) -> np.ndarray:
-    """Return (N, 3) points in the frame of the cloud."""
-    return np.stack([columns[axis] for axis in "xyz"], axis=1)
 
 
 def _stamp(message: Any, arrived: int) -> int:

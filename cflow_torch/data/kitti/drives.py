@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, NamedTuple, Sequence
+from typing import NamedTuple, Sequence
 
-from cflow_torch.data.folders import distinct_names, search
+from cflow_torch.data.folders import search
 from cflow_torch.data.paths import PathLike, as_path
 
 _DEEPEST = 6  # levels below the root; <root>/kitti/raw/<date>/<drive> has four
@@ -24,6 +24,11 @@ class KITTIDrive(NamedTuple):
     def __str__(self) -> str:
         return str(self.clouds)
 
+    @property
+    def folder(self) -> Path:
+        """The folder after which the drive is named."""
+        return self.clouds if self.layout == "tracking" else self.root
+
 
 def find_kitti_drives(root: PathLike) -> list[KITTIDrive]:
     """Find all drives at most six levels below a folder, sorted by path.
@@ -34,7 +39,6 @@ def find_kitti_drives(root: PathLike) -> list[KITTIDrive]:
         - sequence (odometry, SemanticKITTI): `<NN>/velodyne/000000.bin`, if the folder has calib.txt or labels, or lies
           in a folder `sequences`. It is named NN.
         - tracking: `velodyne/<NNNN>/000000.bin`, named NNNN.
-        If several drives have the same name, we put the names of their parent folders in front, as many as it needs.
         You may also pass a folder inside a drive, down to its clouds.
     """
     top = as_path(root)
@@ -43,7 +47,7 @@ def find_kitti_drives(root: PathLike) -> list[KITTIDrive]:
         resolved = top.resolve()
         found = [drive for parent in (resolved.parent, resolved.parent.parent) for drive in _drives_of(parent)]
         found = [drive for drive in found if resolved in (drive.clouds, drive.clouds.parent)]
-    return _with_distinct_names(sorted(found))
+    return sorted(found)
 
 
 def _drives_of(folder: Path) -> list[KITTIDrive]:
@@ -66,13 +70,3 @@ def _has_clouds(folder: Path, suffixes: Sequence[str] = (".bin",)) -> bool:
     if not folder.is_dir():
         return False
     return any(path.suffix in suffixes and _FRAME.fullmatch(path.stem) for path in folder.iterdir())
-
-
-def _with_distinct_names(drives: list[KITTIDrive]) -> list[KITTIDrive]:
-    above = []
-    for drive in drives:
-        # Folder names above the drive, nearest first, without those that belong to the layout.
-        parents: Any = drive.root.resolve() if drive.layout == "tracking" else drive.root.resolve().parent
-        above.append([part for part in parents.parts[1:] if part not in ("sequences", "dataset")][::-1])
-    names = distinct_names([drive.name for drive in drives], above)
-    return [drive._replace(name=name) for drive, name in zip(drives, names)]

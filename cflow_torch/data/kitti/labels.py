@@ -41,7 +41,7 @@ _CLASSES = {
     "REGULAR_VEHICLE": (10, 252),
     "TRUCK": (18, 258),
 }
-MOVING = (251, 259)  # the first and last class of moving points; 251 in labels that tell only static (9) and moving
+_MOVING = (251, 259)  # the first and last class of moving points; 251 in labels that tell only static (9) and moving
 GROUND = (40, 44, 48, 49, 60, 72)  # road, parking, sidewalk, other ground, lane marking, terrain
 UNLABELLED = (0, 1)  # unlabelled, outlier
 _NUM_CLASSES = 1 << 16
@@ -124,6 +124,11 @@ def read_classes(file: Path, rows: int) -> tuple[np.ndarray, np.ndarray]:
     if len(values) != rows:
         raise CFlowError(f"{file} has {len(values)} labels for {rows} points; copy it again")
     return (values & 0xFFFF).astype(np.uint16), (values >> 16).astype(np.uint16)
+
+
+def are_moving(classes: np.ndarray) -> np.ndarray:
+    first, last = _MOVING
+    return (classes >= first) & (classes <= last)
 
 
 def class_categories() -> np.ndarray:

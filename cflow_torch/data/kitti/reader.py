@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from cflow_torch.data.arrays.cloud_file import read_table
+from cflow_torch.data.arrays.folder import read_all
 from cflow_torch.data.arrays.poses_text import read_poses, read_times
 from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.arrays.tables import read_numbers
@@ -15,12 +17,13 @@ from cflow_torch.data.boxes import flow_from_boxes
 from cflow_torch.data.calibration import CAMERA_KEYS, read_calibration, transform
 from cflow_torch.data.camera import Camera
 from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.folders import visible
 from cflow_torch.data.kitti import labels as stored_labels
 from cflow_torch.data.kitti.drives import KITTIDrive, find_kitti_drives
-from cflow_torch.data.kitti.geometry import IMAGE_SIZE, in_image, png_size, poses_from_oxts
+from cflow_torch.data.kitti.geometry import IMAGE_SIZE, NUM_USED, in_image, png_size, poses_from_oxts
 from cflow_torch.data.kitti.labels import FrameBoxes
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.paths import PathLike, exist, remote_errors
+from cflow_torch.data.paths import PathLike, exist, read_bytes, remote_errors
 from cflow_torch.data.trajectory import Trajectory
 from cflow_torch.errors import CFlowError
 from cflow_torch.transforms import transform_points
@@ -76,7 +79,7 @@ class KITTILog(ArraysLog):
         root, is_sequence = source.root, source.layout == "sequence"
         is_auto = isinstance(poses, str) and poses == "auto"
         with remote_errors(root):
-            self._label_files = root / "labels" if is_sequence and (root / "labels").is_dir() else None
+            self._label_files = {file.stem: file for file in visible(root / "labels")} if is_sequence else {}
             if is_sequence:
                 calibration = "auto" if is_auto else None
                 super().__init__(root, poses, calibration=calibration, suffix=".bin")
@@ -103,39 +106,35 @@ class KITTILog(ArraysLog):
 
     def sweep(self, index: int) -> Sweep:
         sweep = super().sweep(index)
-        if self._label_files is None or sweep.is_ground is not None:
+        classes = self._classes(index, len(sweep.points)) if sweep.is_ground is None else None
+        if classes is None:
             return sweep
-        classes, _ = self._classes(index, len(sweep.points))
-        is_ground = np.isin(classes, stored_labels.GROUND)
+        is_ground = np.isin(classes[0], stored_labels.GROUND)
         return Sweep(sweep.points, is_ground if is_ground.any() else None, sweep.pose, sweep.timestamp_ns)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
-        """Read reflectance and, in SemanticKITTI, class and instance of the points of sweep `index`."""
-        columns = {"reflectance": super().columns(index)["column_3"]}
-        if self._label_files is not None:
-            columns["class"], columns["instance"] = self._classes(index, len(columns["reflectance"]))
-        return columns
+        """Read reflectance and other columns and, in SemanticKITTI, class and instance of the points of a sweep."""
+        self._timestamp(index)
+        points, stored = read_table(self.files[index], self._bin_columns)
+        columns = {"reflectance" if name == "column_3" else name: values for name, values in stored.items()}
+        classes = self._classes(index, len(points))
+        return columns if classes is None else {**columns, "class": classes[0], "instance": classes[1]}
 
     def moving(self, index: int) -> np.ndarray | None:
         """Read which points of sweep `index` belong to a class of moving points, (N,) bool; None without labels."""
-        self._timestamp(index)
-        if self._label_files is None:
-            return None
-        classes = self.columns(index)["class"]
-        first, last = stored_labels.MOVING
-        return (classes >= first) & (classes <= last)  # type: ignore[no-any-return]
+        classes = self.columns(index).get("class")
+        return None if classes is None else stored_labels.are_moving(classes)
 
     def _labels(self, index: int) -> FlowLabels | None:
         boxes = self._boxes
-        if self.poses is None or (self._label_files is None and not boxes):
+        classes = self.columns(index).get("class") if self._label_files else None
+        if self.poses is None or (classes is None and not boxes):
             return None
         points = np.asarray(super().sweep(index).points, np.float64)
         T_ego1_ego0 = np.linalg.inv(self.poses[index + 1]) @ self.poses[index]
-        moving = self.moving(index)
-        if moving is not None:
-            classes = self.columns(index)["class"]
+        if classes is not None:
             flow = (transform_points(points, T_ego1_ego0) - points).astype(np.float32)
-            is_valid = ~moving & ~np.isin(classes, stored_labels.UNLABELLED)
+            is_valid = ~stored_labels.are_moving(classes) & ~np.isin(classes, stored_labels.UNLABELLED)
             return FlowLabels(flow, stored_labels.class_categories()[classes], is_valid)
         pair = [boxes.get(self._frames[k], stored_labels.no_boxes()) for k in (index, index + 1)]
         labels = flow_from_boxes(points, pair[0].boxes, pair[1].boxes, T_ego1_ego0)
@@ -144,12 +143,13 @@ class KITTILog(ArraysLog):
     def _is_annotated(self, points: np.ndarray, boxes: FrameBoxes) -> np.ndarray:
         camera = self._camera()
         if camera is not None:
-            return in_image(points, camera[1] @ camera[0], boxes.ignored)
+            return in_image(points, camera[1] @ camera[0], self._image_size(_ANNOTATED_CAMERA), boxes.ignored)
         return np.abs(np.arctan2(points[:, 1], points[:, 0])) < _UNKNOWN_VIEW  # type: ignore[no-any-return]
 
-    def _classes(self, index: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
-        folder: Any = self._label_files
-        return stored_labels.read_classes(folder / f"{self.files[index].stem}.label", rows)
+    def _classes(self, index: int, rows: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the class and the instance of each point, (N,) each; None = the sweep has no file of labels."""
+        file = self._label_files.get(self.files[index].stem)
+        return None if file is None else stored_labels.read_classes(file, rows)
 
     def _read_times(self) -> None:
         """Read the times of a raw drive: a line per frame, YYYY-MM-DD hh:mm:ss and 9 decimals."""
@@ -157,7 +157,10 @@ class KITTILog(ArraysLog):
         if not exist(file):
             return
         with file_errors(file):
-            self.timestamps = read_times(file)[self._frames].tolist()
+            lines = read_bytes(file).splitlines()
+            times = read_times(file).tolist()
+            of_frame = dict(zip((frame for frame, line in enumerate(lines) if line.strip()), times))  # some are empty
+            self.timestamps = [of_frame[frame] for frame in self._frames]
         self._has_times = True
 
     def _poses_of_oxts(self) -> Trajectory | None:
@@ -167,33 +170,44 @@ class KITTILog(ArraysLog):
         """
         root, name = self.drive.root, self.drive.clouds.name
         is_raw = self.drive.layout == "raw"
-        folder = root / "oxts" / "data" if is_raw else root / "oxts"
-        wanted = [f"{file.stem}.txt" for file in self.files] if is_raw else [f"{name}.txt"]
-        with remote_errors(root):
-            known = {file.name for file in folder.glob("*.txt") if file.stat().st_size > 0}
         times = self._times_of_oxts() if is_raw else None
-        if times is not None:
-            wanted = [name for name in sorted(known) if int(Path(name).stem) < len(times)]
-        found = [each for each in wanted if each in known]
+        measured, count = self._measurements(times)
         calibration = self._calibration("imu_to_velo")
-        if 2 * len(found) <= len(wanted) or calibration is None:
+        if 2 * len(measured) <= count or calibration is None:
             what = f"there is no oxts/{name}.txt"
             if calibration is None:
                 what = "calib_imu_to_velo.txt of its day is missing" if is_raw else f"calib/{name}.txt is missing"
             elif is_raw:
-                what = f"oxts/data has {len(found)} measurements for {len(wanted)} sweeps"
+                what = f"oxts/data has {len(measured)} measurements for {count} sweeps"
             where = f"{root}{' or the folder of the day' if is_raw else ''}"
             self._note(f"{what}, so it has no poses. Download it to {where}, or set data.odometry=true")
             return None
-        table = np.concatenate([read_numbers(folder / each) for each in found])
-        poses = poses_from_oxts(table, folder / found[0])
+        files = list(measured)
+        poses = poses_from_oxts(np.concatenate(list(measured.values())), files[0])
         names = ("imu_to_velo.R imu_to_velo.T", "Tr_imu_velo", "Tr_imu_to_velo")
         T_world_lidar = poses @ np.linalg.inv(transform(calibration, root, *names))
         poses = np.linalg.inv(T_world_lidar[0]) @ T_world_lidar
         if times is not None:
-            return Trajectory(poses, times[[int(Path(name).stem) for name in found]], False, str(folder))
-        labels = found if is_raw else [f"{frame:06d}" for frame in range(len(table))]
-        return Trajectory(poses, None, False, str(folder), labels)
+            times, rows = np.unique(times[[int(file.stem) for file in files]], return_index=True)
+            return Trajectory(poses[rows], times, False, str(files[0].parent))
+        labels = [file.name for file in files] if is_raw else [f"{frame:06d}" for frame in range(len(poses))]
+        return Trajectory(poses, None, False, str(files[0].parent), labels)
+
+    def _measurements(self, times: np.ndarray | None) -> tuple[dict[Path, np.ndarray], int]:
+        """Return the numbers of the measurements in each file that is not cut, (K, 6), and how many files we need.
+
+        `times` are those of drives that are not synchronised.
+        """
+        is_raw = self.drive.layout == "raw"
+        folder = self.drive.root / "oxts" / "data" if is_raw else self.drive.root / "oxts"
+        with remote_errors(folder):
+            known = [file for file in sorted(folder.glob("*.txt")) if file.stat().st_size > 0]
+        wanted = {file.stem for file in self.files} if is_raw else {self.drive.clouds.name}
+        if times is not None:
+            wanted = {file.stem for file in known if int(file.stem) < len(times)}
+        read = read_all([file for file in known if file.stem in wanted], read_numbers, self._note)
+        whole = {file: numbers for file, numbers in read.items() if numbers.shape[1] > NUM_USED}
+        return {file: numbers[:, :NUM_USED] for file, numbers in whole.items()}, len(wanted)
 
     def _times_of_oxts(self) -> np.ndarray | None:
         """Return the nanoseconds of the measurements of a drive that is not synchronised; None = it is.
@@ -203,7 +217,7 @@ class KITTILog(ArraysLog):
         of_sweeps, of_oxts = (self.drive.root / name / "timestamps.txt" for name in ("velodyne_points", "oxts"))
         if not self._has_times or not exist(of_oxts):
             return None
-        times = read_times(of_oxts)
+        times = read_times(of_oxts, is_sorted=False)
         return None if len(times) == len(read_times(of_sweeps)) else times
 
     def _poses_of_kitti360(self) -> Trajectory | None:
