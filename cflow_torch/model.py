@@ -149,15 +149,11 @@ class SceneFlowModel(nn.Module):
         """
         dynamo = sys.modules.get("torch._dynamo")  # loaded if anyone compiles; an import takes seconds
         estimate = self._estimate if dynamo is None else dynamo.disable(self._estimate)
-        results: list[FlowResult] = estimate(windows)
-        for problem in inactive_problems(windows, results, self.config) if warns else ():
-            if problem:
-                warn(problem)
-        return results
+        return estimate(windows, warns)  # type: ignore[no-any-return]
 
     @torch.no_grad()
     @one_thread()
-    def _estimate(self, windows: Sequence[Window]) -> list[FlowResult]:
+    def _estimate(self, windows: Sequence[Window], warns: bool) -> list[FlowResult]:
         """Estimate the flow of every window, see `forward`."""
         check_windows(windows, self.config)
         grid = self.grid(self.config.pixel_sizes[-1])
@@ -173,6 +169,9 @@ class SceneFlowModel(nn.Module):
                     motion = self.motion(batch)
                 with stage("spread"):  # outside of inference mode: a training loop may use these tensors
                     results += _results(batch, motion)
+        for problem in inactive_problems(windows, results, self.config) if warns else ():
+            if problem:
+                warn(problem)
         return results
 
 
