@@ -9,13 +9,13 @@ import numpy as np
 
 from cflow_torch.applications.cleaning import CleanLog
 from cflow_torch.data.arrays import ArraysLog
-from cflow_torch.data.arrays.cloud_file import SUFFIXES, copy_rows, stem_of
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, copy_rows
 from cflow_torch.data.arrays.writer import POINTS_FOLDER, SweepSides, write_sides, write_sweep
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
-from cflow_torch.data.paths import GZ
+from cflow_torch.data.paths import stem_of, suffix_of
 from cflow_torch.diagnosis.conventions import OF_POINTS, WORLD
 from cflow_torch.types import CFlowError
 
@@ -94,9 +94,8 @@ def own_suffix(log: Log) -> str:
     own = log.unwrapped
     if not isinstance(own, ArraysLog):
         return ".npy"
-    file = own.files[0]
-    suffix = file.with_suffix("").suffix if file.suffix.lower() == GZ else file.suffix
-    return suffix if suffix.lower() in SUFFIXES else ".npy"
+    suffix = suffix_of(own.files[0])
+    return suffix if suffix in SUFFIXES else ".npy"
 
 
 def stored_masks(folder: Path, log: Log) -> Callable[[int], np.ndarray]:

@@ -15,7 +15,7 @@ from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.applications.track_table import Table
 from cflow_torch.applications.tracking import LogTracker
 from cflow_torch.config import make_config
-from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper, TimedLog, window
+from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper, window
 from cflow_torch.estimate import make_model
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.transforms import transform_points
@@ -65,8 +65,10 @@ class MaskedLog(LogWrapper):
     def labels(self, index: int) -> FlowLabels | None:
         """Truth of the pair (index, index + 1) without the removed rows."""
         labels = self.log.labels(index)
+        if labels is None:
+            return None
         is_kept = ~self.removed(index)
-        return labels and FlowLabels(labels.flow[is_kept], labels.category[is_kept], labels.is_valid[is_kept])
+        return FlowLabels(labels.flow[is_kept], labels.category[is_kept], labels.is_valid[is_kept])
 
     def eval_mask(self, index: int) -> np.ndarray | None:
         return self._kept(self.log.eval_mask(index), index)
@@ -122,7 +124,7 @@ class CleanLog(MaskedLog):
         self._bits: list[np.ndarray] | None = None
         self.num_stopped: int | None = None
         self._tracks_objects = remove_stopped
-        self._timed = TimedLog(self.log, sweep_interval)
+        self._sweep_interval = sweep_interval
 
     def _moving_or_missing(self, index: int) -> np.ndarray:
         points = as_numpy(self.log.sweep(index).points)[:, :3]
@@ -130,6 +132,8 @@ class CleanLog(MaskedLog):
 
     def moving(self, index: int) -> np.ndarray:
         """(N,) bool, True for the points of sweep `index` of the log that are removed because they move.
+
+        The rows are those of the given log, unlike in `MaskedLog`.
 
         Raises:
             CFlowError: a sweep cannot be read, or its flow has another number of rows.
@@ -175,7 +179,7 @@ class CleanLog(MaskedLog):
 
     def _track(self) -> list[np.ndarray]:
         """Packed bits of `moving` for every sweep: points of objects that move, have stopped, or have yet to start."""
-        tracker = LogTracker(self._timed)
+        tracker = LogTracker(self.log, self._sweep_interval)
         bits = []
         for index in range(len(self.timestamps)):
             bits.append(np.packbits(self._moves(index)))

@@ -97,21 +97,27 @@ def find_labels(
     tree: Callable[..., Any] = import_optional(
         "scipy.spatial", "labels need SciPy (extra label): pip install scipy"
     ).cKDTree
+    seconds = log.sweep_times(model.config.sweep_interval)
     log = CachedLog(log, 3)
     last = [*sorted(log.gaps), len(log) - 1]
     parts = [range(begin, end + 1) for begin, end in zip([0, *(index + 1 for index in last)], last)]
     given = iter(flows)
     for part in parts:
-        yield from _label_part(log, part, given, model, tree, workers)
+        yield from _label_part(log, part, given, model, tree, workers, seconds)
     if next(given, None) is not None:
         raise CFlowError(_WRONG_NUMBER.format(log.log_id, len(log.pairs), "more"))
 
 
 def _label_part(
-    log: Log, part: range, flows: Iterator[FlowResult], model: SceneFlowModel, tree: Callable[..., Any], workers: int
+    log: Log,
+    part: range,
+    flows: Iterator[FlowResult],
+    model: SceneFlowModel,
+    tree: Callable[..., Any],
+    workers: int,
+    seconds: np.ndarray,
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Yield the labels of sweeps without a gap, see `find_labels`; `flows` goes on to those of later parts."""
-    seconds = log.sweep_times(model.config.sweep_interval)
     dynamic: list[DynamicPoints] = []
     groups: list[np.ndarray] = []
     others = [*part[1:], part[-2:][0]]  # index of the sweep to which the flow of each sweep leads

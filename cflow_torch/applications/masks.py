@@ -26,8 +26,8 @@ def write_masks(folder: Path, log: Log, results: Iterable[tuple[int, FlowResult]
 
     Args:
         folder: created if it does not exist.
-        log: a log whose reader knows the calibration of its cameras (`Log.cameras`). If its sweeps have no time stamps,
-            give a `TimedLog`; else we take them for 0.1 s apart.
+        log: a log whose reader knows the calibration of its cameras (`Log.cameras`). Sweeps without
+            time stamps are taken to be 0.1 s apart; give a `TimedLog` for another interval.
         results: (index, flow of sweep `index` to `index + 1`).
         table: tracks of the log, see `track`.
 

@@ -83,8 +83,8 @@ class Tracker:
 
     The flow moves the points of a group to the next sweep. There, the group that shares the most voxels with them is
     the same object. We track a stopped object as long as there are points in its box. If an object is not seen for up
-    to three sweeps, or if sweeps are missing for up to three intervals, or a second if that is more, we predict its
-    position from its velocity. Memory: the points of the current tracks.
+    to three sweeps, we predict its position from its velocity. We do the same if sweeps are missing, for up to three
+    intervals or one second, whichever is longer. Memory: the points of the current tracks.
 
     Args:
         sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
@@ -168,10 +168,8 @@ class Tracker:
             interval = (end - begin) * 1e-9
         elapsed = interval if last is None else now - last
         if not (interval > 0 and elapsed > 0):
-            raise CFlowError(
-                f"sweep t is {elapsed:.3f} s later than the last one, and t+1 {interval:.3f} s later than t: push "
-                "sweeps in the order of time"
-            )
+            late = f"t is {elapsed:.3f} s after the last sweep" if interval > 0 else f"t+1 is {interval:.3f} s after t"
+            raise CFlowError(f"sweep {late}: push sweeps in the order of time")
         self._clock = now, now + interval
         return Times(now, interval, elapsed, late=0.0 if last is None else now - due)
 
@@ -336,17 +334,17 @@ def track(
     Returns:
         Column -> (R,) array, which `pandas.DataFrame(table)` takes. There is a row for each track and sweep in which it
         is seen, sorted by sweep, then id. In up to three sweeps before its flow begins, and in such gaps, it is seen
-        where enough points are in the place from which its flow comes. In the last sweep, and in another one without a
-        result after one with it, it is seen where enough points are in the place to which its flow leads. No track goes
-        on after a pause of three intervals and a second. The columns are:
+        where enough points are in the place from which its flow comes. In a sweep without a result that follows one
+        with a result, such as the last sweep, it is seen where enough points are in the place to which its flow leads.
+        No track goes on after a pause that is longer than three intervals and longer than a second. The columns are:
         `sweep`, `timestamp_ns`, `id`;
         x, y, z: smoothed centre of the whole box, metres in the world; vx, vy, vz: its velocity over ground, m/s;
         `velocity_std`: m/s, standard deviation of each of vx, vy and vz, if errors are independent;
         length (along the heading), width, height: metres, of the whole box, the same in all rows of a track;
         `heading`: radians in the world from +x to the left, from the motion, kept at rest;
         `class`: pedestrian, cyclist, car or truck, by size and speed alone;
-        `age`: seconds since the track was first seen; `num_moving`: sweeps so far in which it moved, where its flow is
-        missing that of the sweep in which we looked for it;
+        `age`: seconds since the track was first seen; `num_moving`: sweeps so far in which it moved; where its flow is
+        missing, the number of the sweep whose flow led there;
         `is_moving`: False = the track moved before, and is static now;
         `cluster_id`: of this sweep's flow, -1 while it is static or where its flow is missing; `num_points`;
         `confidence`: of the flow when it last moved, NaN where the method has none;

@@ -90,6 +90,7 @@ def _record(cfg: Clean, log: Log) -> dict[str, Any]:
     if cfg.flow is not None:
         del made["model"]  # it is not used
         made["flow_by"] = method_of_flow(cfg.flow, log.log_id)
+        made["sweep_interval"] = interval_of_flow(cfg, log.log_id)
     return made
 
 

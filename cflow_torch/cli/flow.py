@@ -23,7 +23,7 @@ from cflow_torch.cli.track_formats import TRACK_FORMATS
 from cflow_torch.data.catalog import Logs, source_name
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, POINTS, add_track_ids, has_track_ids, read_flow
 from cflow_torch.data.hdf5.writer import check_result_name, check_writable, write_hdf5_results
-from cflow_torch.data.log import Log, TimedLog
+from cflow_torch.data.log import CachedLog, Log, TimedLog
 from cflow_torch.fleet.manifest import (
     complete_frames,
     drivestudio_masks_folder,
@@ -102,7 +102,7 @@ def _write_logs(cfg: Flow, run: FlowRun) -> Failures:
     wanted = [name for name in ("tracks", "labels", "masks") if getattr(cfg, name)]
     for part in tqdm(run.parts, desc=" and ".join(wanted), unit="log", disable=None):
         with collect_failures(failures, source_name(part.source)):
-            log = TimedLog(logs.open(part.source), cfg.model.sweep_interval)
+            log = TimedLog(CachedLog(logs.open(part.source), 2), cfg.model.sweep_interval)
             pairs = log.pairs  # the pair over a gap has no flow
             if not complete_frames(output / log.log_id) >= {int(log.timestamps[index]) for index in pairs}:
                 tqdm.write(f"{log.log_id}: no {' and '.join(wanted)}, because frames are missing")

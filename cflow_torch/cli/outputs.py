@@ -88,8 +88,9 @@ def read_config(folder: Path) -> dict[str, Any]:
     file = folder / _CONFIG
     if not file.exists():
         return {}
+    content = file.read_bytes()
     with suppress(Exception):  # whatever a file of others holds
-        config: Any = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
+        config: Any = OmegaConf.to_container(OmegaConf.create(content.decode("utf-8")))
         if "cflow_torch" in config["versions"]:
             return config  # type: ignore[no-any-return]
     raise CFlowError(f"{file} is not a record of cflow, and we do not replace it: give output=FOLDER")

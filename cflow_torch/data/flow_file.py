@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Sequence
 
 import numpy as np
@@ -69,9 +68,10 @@ def add_track_ids(path: PathLike, track_id: np.ndarray) -> None:
 def has_track_ids(path: PathLike) -> bool:
     """Test whether a flow file has the column `track_id`. Of a local file, only the footer is read."""
     path = as_path(path)
-    opened = partial(pa.memory_map, str(path)) if not is_remote(path) else lambda: pa.BufferReader(read_bytes(path))
-    with file_errors(path), opened() as source:
-        return TRACK_ID in pa.ipc.open_file(source).schema.names
+    with file_errors(path):
+        source = pa.BufferReader(read_bytes(path)) if is_remote(path) else pa.memory_map(str(path))
+        with source:
+            return TRACK_ID in pa.ipc.open_file(source).schema.names
 
 
 def read_flow(path: PathLike) -> FlowResult:

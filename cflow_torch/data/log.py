@@ -313,7 +313,9 @@ def add_gaps_in_time(log: Log) -> None:
     gaps = [gap for gap in gaps_in(steps) if gap not in log.gaps]
     if gaps:
         first = f"the first is {steps[gaps[0]]:.2g} s long, after sweep {gaps[0]}"
-        log._note(f"it has {len(gaps)} gaps between sweeps ({first}); no window reaches over them")
+        log._note(
+            f"it has {len(gaps)} gaps between sweeps ({first}); no history or future of a window reaches over them"
+        )
         log.gaps = log.gaps.union(gaps)
 
 
@@ -346,7 +348,7 @@ def _readable(log: Log, indices: range) -> Iterator[Sweep]:
 
 
 def windows(log: Log, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
-    """Iterate over the windows of all pairs of a log, in order; each sweep is read once."""
+    """Iterate over the windows of all sweeps but the last one, also of those before gaps; each sweep is read once."""
     cached = CachedLog(log, num_history + num_future + 2)
     return (window(cached, index, num_history, num_future) for index in range(len(log.timestamps) - 1))
 

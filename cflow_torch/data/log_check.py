@@ -278,15 +278,23 @@ def _mask(log: Log) -> list[Finding]:
     mask = as_numpy(sweep.is_ground)
     share = float(mask.mean()) if len(mask) else 0.0
     text = f"{100 * share:.0f} % of the points of the first sweep"
-    fix = ""
+    problem = _problem_of_mask(log, mask, share)
+    if problem:
+        return [Finding("ground", WRONG, f"{text}, {problem}", True)]
+    return [Finding("ground", RIGHT, text, True)]
+
+
+def _problem_of_mask(log: Log, mask: np.ndarray, share: float) -> str:
+    """Return what is wrong with the ground mask of the first sweep; "" = nothing, or it cannot be compared."""
     if share == 1:
-        fix = "so no point would have flow: give masks of the ground alone, or none"
-    elif share > 0 and not _problem_of(log, 0)[1]:
-        fit = _fit_of_mask(as_numpy(sweep.points)[:, :3], mask)
-        fix = "invert the mask, True = ground" if fit < -_MISFIT else fix
-        fix = "has it the rows of this sweep, in their order?" if abs(fit) <= _MISFIT else fix
-        text += ", which are not those that lie low" if fix else ""
-    return [Finding("ground", WRONG if fix else RIGHT, f"{text}: {fix}" if fix else text, True)]
+        return "so no point would have flow: give masks of the ground alone, or none"
+    if share == 0 or _problem_of(log, 0)[1]:
+        return ""
+    fit = _fit_of_mask(as_numpy(log.sweep(0).points)[:, :3], mask)
+    if fit > _MISFIT:
+        return ""
+    fix = "invert the mask, True = ground" if fit < -_MISFIT else "has it the rows of this sweep, in their order?"
+    return f"which are not those that lie low: {fix}"
 
 
 def _fit_of_mask(points: np.ndarray, mask: np.ndarray) -> float:
@@ -479,7 +487,7 @@ def _times(log: Log) -> list[Finding]:
     if gaps:
         longest = max(gaps, key=interval.__getitem__)
         text += f"; {len(gaps)} gaps, the longest of {interval[longest]:.1f} s after sweep {longest}"
-        return [Finding("times", FOUND, f"{text}. No window reaches over them")]
+        return [Finding("times", FOUND, f"{text}. No history or future of a window reaches over them")]
     if not 0.01 <= usual <= 1:
         return [Finding("times", WRONG, f"{text}: are the times in the unit that the reader expects?")]
     if _change(interval) > _UNEVEN:

@@ -11,7 +11,7 @@ from cflow_torch.config import Config
 from cflow_torch.diagnosis.conventions import INVERTED, STILL, WORLD
 from cflow_torch.diagnosis.point_frame import frame_problem
 from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, judge, make_pair
-from cflow_torch.diagnosis.stillness import LEAST_SHARE, MISPLACED, share_in_place, structure_of
+from cflow_torch.diagnosis.stillness import LEAST_SHARE, MISPLACED, share_of_sweeps
 from cflow_torch.errors import warn
 from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.types import MOVING, Array, FlowResult, Sweep, Window, as_numpy
@@ -107,10 +107,7 @@ def _misses_next(window: Window) -> bool:
     """Test whether pc0 fits the sweep before it, but not pc1."""
     if not window.pch:
         return False
-    points0 = structure_of(window.pc0)
-    before, next_one = (
-        share_in_place(window.pc0, points0, other, structure_of(other)) for other in (window.pch[0], window.pc1)
-    )
+    before, next_one = (share_of_sweeps(window.pc0, other) for other in (window.pch[0], window.pc1))
     return before >= LEAST_SHARE and next_one < MISPLACED * before
 
 

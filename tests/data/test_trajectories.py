@@ -853,3 +853,32 @@ def test_a_gap_in_the_times_splits_a_folder(tmp_path) -> None:
     with pytest.warns(CFlowWarning, match="it has 1 gaps between sweeps .the first is 2.1 s long, after sweep 5"):
         log = open_log("arrays", clouds(tmp_path, late))
     assert log.gaps == {5} and len(window(log, 7, num_history=4).pch) == 1
+
+
+@pytest.mark.parametrize(
+    ("names", "step"),
+    [
+        ([f"20240101_12000{k}" for k in range(5)], 10**9),
+        ([f"1700000000{k:03d}" for k in range(120, 160, 8)], 8 * 10**6),
+        ([f"20240101_120000_{k:03d}" for k in range(5)], None),  # a date and a counter
+    ],
+)
+def test_a_time_that_grows_slowly_is_no_counter(names: list[str], step: int | None) -> None:
+    times = times_of_names(names)
+    assert times is None if step is None else set(np.diff(times)) == {step}
+
+
+@pytest.mark.parametrize(
+    ("lines", "step"),
+    [
+        (["00:00:02", "00:00:04", "00:00:06"], 2 * 10**9),
+        (["1990-01-01 00:00:00", "1990-01-01 00:00:10"], 10**10),
+        (["2011-09-26 13:00:00", "2011-09-26 13:05:00", "2011-09-26 13:10:00"], 300 * 10**9),
+        (["2011-09-26 13:02:25,594", "2011-09-26 13:02:25,694"], 10**8),
+        (["0", "2", "4", "8"], 2 * 10**9),
+        (["0", "6", "12"], 6 * 10**6),  # milliseconds
+    ],
+)
+def test_lines_of_times_have_seconds_or_the_unit_of_their_steps(tmp_path: Path, lines: list[str], step: int) -> None:
+    (tmp_path / "times.txt").write_text("\n".join(lines))
+    assert np.diff(poses_text.read_times(tmp_path / "times.txt"))[0] == step

@@ -20,7 +20,6 @@ from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.column_names import AXES, default_names
 from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.paths import PathLike, as_path, read_bytes, suffix_of
-from cflow_torch.data.paths import stem_of as stem_of
 from cflow_torch.tensors import resolution
 from cflow_torch.types import CFlowError, check_array
 

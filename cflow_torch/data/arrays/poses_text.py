@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, Mapping, Sequence
@@ -239,6 +240,7 @@ def read_times(path: PathLike, is_sorted: bool = True) -> np.ndarray:
 
 
 def parse_times(content: bytes, path: Path, is_sorted: bool = True) -> np.ndarray:
+    content = re.sub(rb"(?m)(:\d\d),(?=\d{3,}\s*$)", rb"\1.", content)  # a fraction of a second, no other column
     names, words, _ = parse_table(content, path)
     columns = [column for column, name in enumerate(names) if role_of_name(name) == "time"]
     if words.shape[1] > 1 and not columns:

@@ -222,9 +222,10 @@ class ArraysLog(Log):
         known = np.flatnonzero(np.isfinite(numbers).all(axis=1) & numbers[:, 3:].any(axis=1))
         if (numbers[known] == np.eye(7)[3]).all():
             return None
-        what = f"VIEWPOINT of {self.folder}, of its poses number"
         poses = np.full((len(numbers), 4, 4), np.nan)
-        poses[known] = poses_from_quaternions(numbers[known, :3], numbers[known, 3:], lambda k: f"{what} {k}")
+        poses[known] = poses_from_quaternions(
+            numbers[known, :3], numbers[known, 3:], lambda k: f"{self.files[known[k]]}: VIEWPOINT"
+        )
         return Trajectory(poses, None, False, _VIEWPOINT)
 
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
@@ -326,7 +327,8 @@ class ArraysLog(Log):
         if self._has_times or not gaps or not _are_regular(numbers):
             return []
         first = self.files[gaps[0]].name
-        self._note(f"sweeps are missing by the numbers of its files, first after {first}; no window reaches over them")
+        missing = f"sweeps are missing by the numbers of its files, first after {first}"
+        self._note(f"{missing}; no history or future of a window reaches over them")
         return gaps  # type: ignore[no-any-return]
 
 

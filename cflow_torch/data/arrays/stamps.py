@@ -7,14 +7,15 @@ from datetime import datetime, timezone
 from decimal import Decimal
 from typing import Sequence
 
-_UNITS = (1, 10**3, 10**6, 10**9)  # nanoseconds in ns, us, ms and s
-_SHORTEST = 1_200_000  # nanoseconds from one time to the next, which tell the unit
+# Nanoseconds in ns, us, ms and s, and the shortest step from one time to the next that tells the unit. Some poses are a
+# few seconds apart, hardly any a few milliseconds.
+_UNITS = {1: 1_200_000, 10**3: 1_200_000, 10**6: 5_000_000, 10**9: 0}
 _LONGEST = 10**11  # the same, of unix times
 _UNIX = range(10**18, 41 * 10**17)  # nanoseconds since 1970: from 2001 to 2099
 # After colons, "-08:00" and "-0800" are a time zone, else "-123456" is a fraction.
 _DATE = re.compile(
     r"(?<!\d)(\d{4})\D?(\d\d)\D?(\d\d)\D(\d\d)\D?(\d\d)\D?(\d\d)"
-    r"(?:(?:[._]|(?<!:\d\d)[^\d+])(\d+)(?![\d:]))?(?:([+-])(\d\d):?(\d\d)(?!\d))?"
+    r"(?:(?:[.,_]|(?<!:\d\d)[^\d+])(\d+)(?![\d:]))?(?:([+-])(\d\d):?(\d\d)(?!\d))?"
 )
 _CLOCK = re.compile(r"(?<![\d:])(\d\d?):(\d\d):(\d\d)(?:[.,](\d+))?(?![\d:])")
 _STAMP = re.compile(r"(?<!\d)([1-9]\d{12}|[1-9]\d{15,17}|[1-8]\d{18})(?!\d)")  # no numbers with zeros in front
@@ -27,16 +28,17 @@ def nanoseconds_of_numbers(words: Sequence[str]) -> list[int]:
     """Convert texts of times to nanoseconds exactly: unix times need 19 digits, a float has 16.
 
     They may be in s, ms, us or ns. The unit is the one in which they are unix times with a median step of at most
-    100 s. Times from another start have the smallest unit in which the step is at least 1.2 ms.
+    100 s. Times from another start have the smallest unit in which the step is at least 1.2 ms, of milliseconds 5 ms.
+    Numbers that all have nine decimals are seconds.
     """
     numbers = [Decimal(word) for word in words]
     distinct = sorted(set(numbers))
     steps = sorted(after - before for before, after in zip(distinct, distinct[1:])) or [Decimal(0)]
     step = steps[len(steps) // 2]
-    units = [unit for unit in _UNITS if int(distinct[-1] * unit) in _UNIX and step * unit <= _LONGEST]
-    units += [unit for unit in _UNITS if step * unit >= _SHORTEST]
-    unit = next(iter(units), 10**9)
-    return [int((number * unit).to_integral_value()) for number in numbers]
+    units = [10**9] if all(number.as_tuple().exponent == -9 for number in numbers) else []
+    units += [unit for unit in _UNITS if int(distinct[-1] * unit) in _UNIX and step * unit <= _LONGEST]
+    units += [unit for unit, shortest in _UNITS.items() if step * unit >= shortest]
+    return [int((number * units[0]).to_integral_value()) for number in numbers]
 
 
 def nanoseconds_of_dates(texts: Sequence[str]) -> list[int] | None:
@@ -86,13 +88,19 @@ def times_of_names(names: Sequence[str]) -> list[int] | None:
 
 
 def _without_counters(names: Sequence[str]) -> Sequence[str]:
-    """Cut off the last number if it has three digits or more in all names, always grows, and mostly by less than 10."""
+    """Cut off the last number if it counts the files.
+
+    A counter has three digits or more in all names, always grows, and mostly by less than 10. It begins below 1000, or
+    the names before it state times.
+    """
     last = [match for match in (re.search(r"(\d{3,})\D*$", name) for name in names) if match]
     numbers = [int(match[1]) for match in last]
     steps = sorted(after - before for before, after in zip(numbers, numbers[1:]))
     are_alike = len(last) == len(names) > 1 == len({len(match[1]) for match in last})
     is_counter = are_alike and steps[0] > 0 and steps[len(steps) // 2] < 10
-    return [name[: match.start()] for name, match in zip(names, last)] if is_counter else names
+    cut = [name[: match.start()] for name, match in zip(names, last)]
+    has_times = any(all(map(pattern.search, cut)) for pattern in (_STAMP, _DATE, _CLOCK, *_SECONDS))
+    return cut if is_counter and (has_times or numbers[0] < 1000) else names
 
 
 def _with_fractions(pairs: Sequence[tuple[str, str]]) -> list[int]:

@@ -38,8 +38,10 @@ def cloud_columns(message: Any) -> dict[str, np.ndarray]:
         kinds = [order + _TYPES[fields[name].datatype] for name in names]
         kind = np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": step})
         tables.append(octets.view(kind).reshape(-1))
-    table = next((table for table in tables if are_plausible(points_of(table))), tables[0])
-    table = table[~missing_returns(points_of(table))]
+    clouds = ((table, points_of(table)) for table in tables)
+    fitting = ((table, points) for table, points in clouds if are_plausible(points))
+    table, points = next(fitting, None) or (tables[0], points_of(tables[0]))
+    table = table[~missing_returns(points)]
     return {name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in names}
 
 

@@ -127,12 +127,15 @@ class KITTILog(ArraysLog):
 
     def _labels(self, index: int) -> FlowLabels | None:
         boxes = self._boxes
-        classes = self.columns(index).get("class") if self._label_files else None
-        if self.poses is None or (classes is None and not boxes):
+        if self.poses is None or not (self._label_files or boxes):
             return None
         points = np.asarray(super().sweep(index).points, np.float64)
+        found = self._classes(index, len(points))
+        if found is None and not boxes:
+            return None
         T_ego1_ego0 = np.linalg.inv(self.poses[index + 1]) @ self.poses[index]
-        if classes is not None:
+        if found is not None:
+            classes, _ = found
             flow = (transform_points(points, T_ego1_ego0) - points).astype(np.float32)
             is_valid = ~stored_labels.are_moving(classes) & ~np.isin(classes, stored_labels.UNLABELLED)
             return FlowLabels(flow, stored_labels.class_categories()[classes], is_valid)
@@ -140,10 +143,14 @@ class KITTILog(ArraysLog):
         labels = flow_from_boxes(points, pair[0].boxes, pair[1].boxes, T_ego1_ego0)
         return FlowLabels(labels.flow, labels.category, labels.is_valid & self._is_annotated(points, pair[0]))
 
+    @cached_property
+    def _annotated_size(self) -> tuple[int, int]:
+        return self._image_size(_ANNOTATED_CAMERA)
+
     def _is_annotated(self, points: np.ndarray, boxes: FrameBoxes) -> np.ndarray:
         camera = self._camera()
         if camera is not None:
-            return in_image(points, camera[1] @ camera[0], self._image_size(_ANNOTATED_CAMERA), boxes.ignored)
+            return in_image(points, camera[1] @ camera[0], self._annotated_size, boxes.ignored)
         return np.abs(np.arctan2(points[:, 1], points[:, 0])) < _UNKNOWN_VIEW  # type: ignore[no-any-return]
 
     def _classes(self, index: int, rows: int) -> tuple[np.ndarray, np.ndarray] | None:
