@@ -18,7 +18,7 @@ LEAST_SHARE = 0.1  # in place, of sweeps that fit
 MISPLACED = 0.5  # part of the usual share, below which sweeps do not fit
 _COMPARED = 300  # points of a sweep that tell whether it fits another one
 _KEY = np.array((1 << 42, 1 << 21, 1))  # of a cell: 21 bits for each of x, y and z, which varies fastest
-_OFFSETS = [int(_KEY @ (x, y, 0)) for x in (-1, 0, 1) for y in (-1, 0, 1)]  # keys of cells next to one another
+_OFFSETS = [int(_KEY @ (x, y, 0)) for x in (-1, 0, 1) for y in (-1, 0, 1)]  # keys of the columns around a cell
 _MOST = 1e5  # metres; coordinates are clamped to it, so that absurd poses do not overflow
 _COLUMN, _TALL = 0.8, 0.35  # metres, side and least height of the columns of structure; ground is flatter
 _LEAST_GROUND = 0.02  # share of points; a mask with less is not believed
@@ -106,11 +106,12 @@ class Structure:
     """The structure of a sweep, (M, 3) float, metres, sorted once to be compared under many transforms."""
 
     def __init__(self, points: np.ndarray) -> None:
-        points = np.clip(np.asarray(points, np.float64), -_MOST, _MOST)
-        keys = cell_keys(np.floor(points / IN_PLACE).astype(np.int64))
-        order = np.argsort(keys, kind="stable")
-        self._points = points[order]
-        self._sorted = np.append(keys[order], np.iinfo(np.int64).max)  # the end, so that every search finds a key
+        self._points = np.clip(np.asarray(points, np.float64), -_MOST, _MOST)
+        # A point is in the nine columns around it, and z varies fastest in a key: one range of keys holds what is near.
+        keys = (cell_keys(np.floor(self._points / IN_PLACE).astype(np.int64))[:, None] + _OFFSETS).ravel()
+        order = np.argsort(keys)
+        self._keys = keys[order]
+        self._rows = order // len(_OFFSETS)  # of the point of each key
 
     def share(self, source: np.ndarray, T_target_source: np.ndarray) -> float:
         """Return the share of source points that have a point of the structure within 0.1 m, 0 to 1.
@@ -137,21 +138,15 @@ class Structure:
     def in_place(self, points: np.ndarray) -> np.ndarray:
         """Test which points, (N, 3) in the frame of the structure, are in place, (N,) bool."""
         moved = np.clip(points, -_MOST, _MOST)
-        in_place = np.zeros(len(moved), bool)
         keys = cell_keys(np.floor(moved / IN_PLACE).astype(np.int64))
         order = np.argsort(keys)  # the searches below are several times faster in this order
-        moved = moved[order]
-        keys = keys[order]
-        for offset in _OFFSETS:  # z varies fastest in a key: the three cells above one another are one range of keys
-            lowest = keys + offset - 1
-            start = np.searchsorted(self._sorted, lowest, "left")
-            near = np.flatnonzero(self._sorted[start] <= lowest + 2)  # points with points of the structure there
-            start = start[near]
-            count = np.searchsorted(self._sorted, lowest[near] + 2, "right") - start
-            row = np.repeat(near, count)
-            neighbour = np.arange(len(row)) + np.repeat(start - np.cumsum(count) + count, count)
-            distance = np.linalg.norm(moved[row] - self._points[neighbour], axis=1)
-            in_place[order[row[distance <= IN_PLACE]]] = True
+        start = np.searchsorted(self._keys, keys[order] - 1, "left")
+        count = np.searchsorted(self._keys, keys[order] + 1, "right") - start
+        row = np.repeat(order, count)
+        neighbour = self._rows[np.arange(len(row)) + np.repeat(start - np.cumsum(count) + count, count)]
+        apart = moved[row] - self._points[neighbour]
+        in_place = np.zeros(len(moved), bool)
+        in_place[row[np.einsum("ij,ij->i", apart, apart) <= IN_PLACE**2]] = True
         return in_place
 
 
