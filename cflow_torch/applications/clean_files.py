@@ -38,7 +38,12 @@ class Removed(NamedTuple):
 
 
 def write_clean_log(
-    clean: CleanLog, log: Log, root: Path, suffix: str | None = None, record: Mapping[str, Any] | None = None
+    clean: CleanLog,
+    log: Log,
+    root: Path,
+    suffix: str | None = None,
+    record: Mapping[str, Any] | None = None,
+    replace: bool = False,
 ) -> Removed:
     """Write a clean log to `root/<log_id>`, as `write_array_log` does, and `removed/NAME.npy` for each sweep.
 
@@ -48,6 +53,7 @@ def write_clean_log(
         root: parent folder, created if it does not exist.
         suffix: suffix of the clouds; None = `own_suffix`.
         record: content of `clean.json` in the folder, such as settings; None = it is not written.
+        replace: replace an older folder when this one is complete; else an older one is a `CFlowError`.
 
     Convention: a mask has (N,) bool for the points of the sweep of `log`, True = not in the clean cloud. If the log is
         a folder of clouds with the same suffix, clouds keep their names, columns, types and VIEWPOINT, and the points
@@ -61,7 +67,7 @@ def write_clean_log(
     viewpoint = _viewpoint(log, suffix)
     total = Removed(0, 0, 0)
     sides = {}
-    with new_folder(root, log.log_id) as folder:
+    with new_folder(root, log.log_id, replace) as folder:
         (folder / REMOVED_FOLDER).mkdir()
         for index in range(len(log.timestamps)):
             name = stem_of(own.files[index]) if isinstance(own, ArraysLog) else f"{index:06d}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any, Callable
@@ -96,9 +95,8 @@ def _record(cfg: Clean, log: Log) -> dict[str, Any]:
 
 def _write(cfg: Clean, log: Log, output: Path, clean: Callable[[Log], CleanLog]) -> str:
     """Write the folder of a log in place of an older one of ours, and return what was removed."""
-    shutil.rmtree(output / log.log_id, ignore_errors=True)
     clean_log = clean(log)
-    removed = write_clean_log(clean_log, log, output, cfg.suffix, _record(cfg, log))
+    removed = write_clean_log(clean_log, log, output, cfg.suffix, _record(cfg, log), cfg.overwrite)
     if clean_log.num_stopped is None:
         return str(removed)
     return f"{removed}; remove_stopped removed {clean_log.num_stopped:,} of them"

@@ -210,4 +210,11 @@ def test_clean_clouds_of_an_earlier_flow_are_not_taken_for_complete(
     assert cflow(*clean) != 0
     message = capsys.readouterr().err
     assert "flow_by.significance was 1.5, is 2.0" in message and "overwrite=true" in message
+    older = {file: file.read_bytes() for file in sorted((tmp_path / "clean" / "drive").rglob("*.npy"))}
+    for frame in (tmp_path / "flow").rglob("*.feather"):
+        frame.rename(frame.with_suffix(".away"))
+    assert cflow(*clean, "overwrite=true") == 1, "a run that fails leaves the older results"
+    assert older == {file: file.read_bytes() for file in sorted((tmp_path / "clean" / "drive").rglob("*.npy"))}
+    for frame in (tmp_path / "flow").rglob("*.away"):
+        frame.rename(frame.with_suffix(".feather"))
     assert cflow(*clean, "overwrite=true") == 0
