@@ -92,8 +92,8 @@ class CleanLog(MaskedLog):
     Args:
         log: any log. Sweeps are read one after the other, and only a few are held in memory.
         model: the method; None = preset `offline`.
-        flow: index -> flow of that pair, in place of a model. We use residual_flow, cluster_id and, if it
-            has it, moving, and with `remove_stopped` also is_valid.
+        flow: index -> flow of that pair, in place of a model. We use residual_flow, cluster_id and, if it has it,
+            moving; with `remove_stopped` also is_valid and, if it has it, confidence.
         remove_stopped: also remove objects before they start and after they stop, such as cars at a light. Tracking
             finds them, also in a sweep without flow. It takes a pass over the log before the first sweep is returned,
             and the memory of 1 bit per point and of the points of tracks.

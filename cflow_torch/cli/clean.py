@@ -28,7 +28,7 @@ from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
 
 MAP_FILE = "map.ply"  # next to its picture, map.png
-_NEEDED = ("residual_flow", "cluster_id", "is_valid")  # of flow files
+_NEEDED = ("residual_flow", "cluster_id", "is_valid", "confidence", "moving")  # of flow files
 
 
 def task(cfg: Clean) -> None:

@@ -206,6 +206,9 @@ def test_clean_clouds_of_an_earlier_flow_are_not_taken_for_complete(
     clean = ("clean", *data, f"output={tmp_path / 'clean'}", f"flow={tmp_path / 'flow'}")
     assert cflow(*flow) == 0 and cflow(*clean) == 0 and cflow(*clean) == 0
     assert "it is complete" in capsys.readouterr().out
+    few = "contents=[residual,cluster_id,score,is_valid]"
+    assert cflow(*flow, few, "overwrite=true") == 0 and cflow(*clean, "overwrite=true") == 1
+    assert "lacks confidence, moving: run `cflow flow` with all contents" in capsys.readouterr().err
     assert cflow(*flow, "model.significance=2", "overwrite=true") == 0
     assert cflow(*clean) != 0
     message = capsys.readouterr().err
@@ -214,6 +217,7 @@ def test_clean_clouds_of_an_earlier_flow_are_not_taken_for_complete(
     for frame in (tmp_path / "flow").rglob("*.feather"):
         frame.rename(frame.with_suffix(".away"))
     assert cflow(*clean, "overwrite=true") == 1, "a run that fails leaves the older results"
+    assert "is missing: run `cflow flow` again" in capsys.readouterr().err
     assert older == {file: file.read_bytes() for file in sorted((tmp_path / "clean" / "drive").rglob("*.npy"))}
     for frame in (tmp_path / "flow").rglob("*.away"):
         frame.rename(frame.with_suffix(".feather"))
