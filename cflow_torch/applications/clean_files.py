@@ -10,12 +10,12 @@ import numpy as np
 from cflow_torch.applications.cleaning import CleanLog
 from cflow_torch.data.arrays import ArraysLog
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, copy_rows
-from cflow_torch.data.arrays.writer import POINTS_FOLDER, SweepSides, write_sides, write_sweep
+from cflow_torch.data.arrays.writer import POINTS_FOLDER, SweepSides, cloud_name, write_sides, write_sweep
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
-from cflow_torch.data.paths import stem_of, suffix_of
+from cflow_torch.data.paths import suffix_of
 from cflow_torch.diagnosis.conventions import OF_POINTS, WORLD
 from cflow_torch.types import CFlowError
 
@@ -70,7 +70,7 @@ def write_clean_log(
     with new_folder(root, log.log_id, replace) as folder:
         (folder / REMOVED_FOLDER).mkdir()
         for index in range(len(log.timestamps)):
-            name = stem_of(own.files[index]) if isinstance(own, ArraysLog) else f"{index:06d}"
+            name = cloud_name(log, index)
             file = folder / POINTS_FOLDER / f"{name}{suffix}"
             removed = clean.removed(index)
             moving = int(clean.moving(index).sum())
@@ -106,11 +106,9 @@ def own_suffix(log: Log) -> str:
 
 def stored_masks(folder: Path, log: Log) -> Callable[[int], np.ndarray]:
     """Return a function that reads the mask of a sweep which `write_clean_log` wrote to `folder`."""
-    own = log.unwrapped
 
     def read(index: int) -> np.ndarray:
-        name = stem_of(own.files[index]) if isinstance(own, ArraysLog) else f"{index:06d}"
-        file = folder / REMOVED_FOLDER / f"{name}.npy"
+        file = folder / REMOVED_FOLDER / f"{cloud_name(log, index)}.npy"
         rows = len(log.sweep(index).points)
         mask = read_npy(file, _WRITE_AGAIN)
         if mask.shape != (rows,) or mask.dtype != bool:

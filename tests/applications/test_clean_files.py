@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,10 @@ from command_line import cflow
 from pyarrow import feather, parquet
 from staged_cars import Staged, straight
 
-from cflow_torch import CFlowError, CleanLog, make_model
+from cflow_torch import CFlowError, CleanLog, Sweep, make_model
 from cflow_torch.applications.clean_files import stored_masks, write_clean_log
 from cflow_torch.applications.cleaning import MaskedLog, static_map_with_intensity
-from cflow_torch.data.arrays import ArraysLog
+from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, copy_rows, read_cloud, write_cloud
 
 DRIVE = Staged([straight((1, 1), (0.9, 0.0), 4)])
@@ -157,6 +158,29 @@ def test_a_map_has_the_intensities_of_its_points(tmp_path: Path) -> None:
     assert intensity[0] == pytest.approx(given[row])
     without = Staged([straight((0, 0), (0.9, 0.0), 4)], np.tile(np.eye(4), (4, 1, 1)))
     assert static_map_with_intensity(without, 0.4)[1] is None
+
+
+class Numbered(Staged):
+    """Sweeps 4, 5, 6, 8, 9 of a data set, without time stamps."""
+
+    def sweep(self, index: int) -> Sweep:
+        return replace(super().sweep(index), timestamp_ns=None)
+
+    def frame_number(self, index: int) -> int:
+        return (4, 5, 6, 8, 9)[index]
+
+
+def test_clouds_of_other_logs_have_the_numbers_of_the_data_set(tmp_path: Path) -> None:
+    log = Numbered([straight((1, 1), (0.9, 0.0), 5)], np.tile(np.eye(4), (5, 1, 1)))
+    numbers = [f"00000{number}.npy" for number in (4, 5, 6, 8, 9)]
+    write_clean_log(CleanLog(log, flow=log.result), log, tmp_path / "clean")
+    written = [tmp_path / "clean" / "staged", write_array_log(log, tmp_path / "all")]
+    assert sorted(file.name for file in (written[0] / "removed").iterdir()) == numbers
+    assert stored_masks(written[0], log)(3).any()
+    for folder in (*written, write_array_log(ArraysLog(written[1]), tmp_path / "again")):
+        back = ArraysLog(folder)
+        assert [file.name for file in back.files] == numbers
+        assert back.gaps == {2} and back.sweep_times() == pytest.approx([0, 0.1, 0.2, 0.4, 0.5])
 
 
 def test_a_mask_of_another_sweep_is_an_error(tmp_path: Path) -> None:
