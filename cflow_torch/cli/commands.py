@@ -289,10 +289,11 @@ class Label(FlowFiles):
 class Eval(Command):
     """Estimates and scores all labelled pairs: tables on the screen, OUTPUT/results.json and OUTPUT/config.yaml.
 
-    A run whose results exist is not repeated, its tables are printed; overwrite=true repeats it. Each job of a sweep
-    (-m) writes to a folder below OUTPUT that is named after its swept settings. At the end of the sweep, a table
-    compares all jobs in OUTPUT; it is also written to OUTPUT/comparison.csv. A sweeper minimises the mean dynamic
-    error.
+    A run whose results exist for the same settings, versions and logs is not repeated, its tables are printed;
+    overwrite=true repeats it, for example with new labels. Each job of a sweep (-m) writes to a folder below OUTPUT
+    that is named after its swept settings. At the end of the sweep, a table compares all jobs in OUTPUT; it is also
+    written to OUTPUT/comparison.csv. A sweeper minimises the mean dynamic error; of definition=av2 the three-way
+    end-point error, of definition=mos 1 - IoU.
 
     examples:
       cflow eval data=av2 data.root=/data/av2/val model=paper

@@ -143,7 +143,7 @@ def _page(
     for scene in scenes:
         drive.add(scene)
     if not drive.frames:
-        raise CFlowError(f"{title}: there is no pair to show")
+        raise CFlowError("there is no pair to show")
     table = tracks()
     if table is not None:
         drive.add_tracks(table)
