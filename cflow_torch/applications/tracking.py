@@ -466,8 +466,12 @@ class LogTracker:
         A track is not seen in a sweep where most of its points are static. If this is so in most of the sweeps in which
         it moves, it is not a track.
         """
+        sweeps_of: dict[int, list[SweepTracks]] = {}
+        for each in self._sweeps:
+            for number in np.unique(each.points.id).tolist():
+                sweeps_of.setdefault(number, []).append(each)
         for number in np.unique(self._confirmed()["id"]).tolist():
-            sweeps = [each for each in self._sweeps if number in each.points.id]
+            sweeps = sweeps_of[number]
             seen = [Sighting(each.points.of_track(number)[0], each.static) for each in sweeps]
             is_static = static_points(seen)
             share = np.array([each.mean() for each in is_static])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tracemalloc
 from pathlib import Path
 from typing import Any, Callable
 
@@ -11,6 +12,8 @@ import numpy as np
 import pytest
 import torch
 from command_line import cflow
+from oracle.static_places import CELL
+from oracle.static_places import static_points as static_points_by_loops
 from pyarrow import feather
 from scenes import pose, rows_of
 from small_logs import make_small_drive
@@ -21,6 +24,7 @@ from cflow_torch.applications import tracking
 from cflow_torch.applications.association import VOXELS, box_of_point, enclosing_boxes, link
 from cflow_torch.applications.instance_files import write_drivestudio
 from cflow_torch.applications.kitti_tracks import write_kitti
+from cflow_torch.applications.static_places import Sighting, cells_of, static_points
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_mot, write_tracks
 from cflow_torch.applications.tracking import track_points
 from cflow_torch.data.arrays import write_array_log
@@ -260,6 +264,37 @@ def test_a_car_that_starts_and_one_that_stops_keep_their_points() -> None:
     assert len(set(table["id"])) == 2
     for sweep in range(12, 21):
         assert (points[sweep].track_id(table["id"]) >= 0).sum() == (log.world(sweep)[2] >= 0).sum()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_static_points_of_a_track_equal_plain_loops(seed: int) -> None:
+    """A box of points passes through random points without a track, which are new in every sweep or stay."""
+    random = np.random.default_rng(seed)
+    stays = random.uniform((-2, -1, 0), (14, 1, 1.5), (400, 3))
+    positions, others = [], []
+    for number in range(14):
+        positions.append(random.uniform((0.8 * number, -0.7, 0), (0.8 * number + 1, 0.7, 1.5), (30, 3)))
+        others.append(
+            np.concatenate([stays[random.random(400) < 0.4], random.uniform((-2, -1, 0), (14, 1, 1.5))[None]])
+        )
+    found = static_points([Sighting(own, np.unique(cells_of(other))) for own, other in zip(positions, others)])
+    names = [{tuple(np.floor(point / CELL).astype(int).tolist()) for point in other} for other in others]
+    expected = static_points_by_loops(positions, names)
+    assert [each.tolist() for each in found] == expected
+    assert 0 < np.mean(expected) < 1
+
+
+def test_the_memory_for_static_points_grows_with_the_length_of_a_track() -> None:
+    """A table of all cells and sweeps of the longer track would have 33 times the memory of the shorter one."""
+    peaks = []
+    for count in (20, 200):
+        body = np.random.default_rng(0).uniform(0, 2, (40, 3))
+        seen = [Sighting(body + [1.5 * number, 0, 0], np.arange(5)) for number in range(count)]
+        tracemalloc.start()
+        static_points(seen)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 15 * peaks[0]
 
 
 def test_two_cars_in_one_cluster_keep_their_ids() -> None:
