@@ -19,7 +19,7 @@ from cflow_torch.data.arrays import ArraysLog
 from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.json_file import read_json
+from cflow_torch.data.json_file import read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
@@ -48,7 +48,7 @@ def task(cfg: Clean) -> None:
                 raise CFlowError(f"{folder} has another log of this run: rename one of two logs of this name")
             removed = "it is complete" if is_written.pop(log.log_id) else _write(cfg, log, output, clean)
             print(f"{folder}: {len(log.timestamps)} sweeps, {removed}{_how_to_read(log, cfg.suffix)}")
-            if cfg.map and not (folder / MAP_FILE).exists():
+            if cfg.map and not _has_map(cfg, folder):
                 print(_write_map(cfg, log, folder))
     finish(failures)
 
@@ -102,10 +102,17 @@ def _write(cfg: Clean, log: Log, output: Path, clean: Callable[[Log], CleanLog])
     return f"{removed}; remove_stopped removed {clean_log.num_stopped:,} of them"
 
 
+def _has_map(cfg: Clean, folder: Path) -> bool:
+    """Test whether the folder of a log has its map with these voxels."""
+    return (folder / MAP_FILE).exists() and read_json(folder / RECORD_FILE)["voxel_size"] == cfg.voxel_size
+
+
 def _write_map(cfg: Clean, log: Log, folder: Path) -> str:
-    """Write the map of a log into its folder, and return a line with its files."""
+    """Write the map of a log into its folder, in place of one with other voxels, and return a line with its files."""
     file = folder / MAP_FILE
     points, intensity = static_map_with_intensity(MaskedLog(log, stored_masks(folder, log)), cfg.voxel_size)
+    file.unlink(missing_ok=True)  # first, so that the record below is never that of another map
+    write_json(folder / RECORD_FILE, {**read_json(folder / RECORD_FILE), "voxel_size": cfg.voxel_size})
     write_cloud(file, points, None if intensity is None else {"intensity": intensity})
     return f"{file}: {len(points):,} points{_draw(points, log.log_id, file.with_suffix('.png'))}"
 

@@ -544,7 +544,7 @@ class Clean(Command):
     map: bool = setting(
         False, "also write the static points in the world, one per voxel, to <log id>/map.ply, and a picture", free=True
     )
-    voxel_size: float = _above_0(0.1, "side of a voxel of the map, in metres")
+    voxel_size: float = _above_0(0.1, "side of a voxel of the map, in metres", free=True)
 
 
 @dataclass(frozen=True)

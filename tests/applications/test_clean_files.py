@@ -217,7 +217,14 @@ def test_the_command_counts_what_it_removes_and_writes_a_map_that_is_missing(
         assert "data.bin_columns=5" in text
         file = tmp_path / "clean" / "drive" / "map.ply"
         assert b"property float intensity" in file.read_bytes()[:300]
+        older = file.read_bytes()
         file.unlink()
+    clean = ("clean", tmp_path / "drive", f"output={tmp_path / 'clean'}", "suffix=.bin", *more)
+    for more, changes in ((("voxel_size=0.8",), True), (("voxel_size=0.8",), False), (("voxel_size=0.4",), True)):
+        before = file.stat().st_mtime_ns if file.exists() else 0
+        assert cflow(*clean, *more) == 0 and "it is complete" in capsys.readouterr().out
+        assert (file.stat().st_mtime_ns != before) == changes, "another map is written, from the masks that are there"
+        assert (file.read_bytes() == older) == ("voxel_size=0.4" in more)
 
 
 def test_clean_clouds_of_an_earlier_flow_are_not_taken_for_complete(
