@@ -299,8 +299,13 @@ def _intensity(columns: Mapping[str, np.ndarray]) -> np.ndarray | None:
 
 def _inside(sweep: Sweep, centre: torch.Tensor, size: torch.Tensor, heading: torch.Tensor) -> np.ndarray:
     """(N,) bool, points of a sweep that are not ground and lie in one of the boxes (world frame)."""
-    is_inside = box_of_point(torch.from_numpy(_world(sweep)), centre, size + MARGIN, heading).numpy() >= 0
-    return is_inside if sweep.is_ground is None else is_inside & ~as_numpy(sweep.is_ground).astype(bool)
+    points = _world(sweep)
+    is_inside = np.isfinite(points).all(1)
+    if sweep.is_ground is not None:
+        is_inside &= ~as_numpy(sweep.is_ground).astype(bool)
+    box = box_of_point(torch.from_numpy(points[is_inside]), centre, size + MARGIN, heading)
+    is_inside[is_inside] = box.numpy() >= 0
+    return is_inside
 
 
 def _world(sweep: Sweep) -> np.ndarray:

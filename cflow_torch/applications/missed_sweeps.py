@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.association import MARGIN, MIN_STOPPED_SHARE, box_of_point, enclosing_boxes
+from cflow_torch.applications.association import MARGIN, MIN_STOPPED_SHARE, enclosing_boxes, points_in_boxes
 from cflow_torch.applications.completion import TrackedPoints
 from cflow_torch.applications.floor import Floor
 from cflow_torch.applications.moving_groups import MIN_POINTS, pose_of
@@ -37,11 +37,8 @@ class FreePoints(NamedTuple):
 
     def inside(self, centre: Tensor, size: Tensor, heading: Tensor) -> np.ndarray:
         """(M,) int64 indices of the points in a box, see `box_of_point`."""
-        reach = float(size[0, :2].norm()) / 2
-        x = float(centre[0, 0])
-        first, last = np.searchsorted(self.position[:, 0], [x - reach, x + reach])
-        box = box_of_point(torch.from_numpy(self.position[first:last]), centre, size, heading)
-        return first + np.flatnonzero(box.numpy() == 0)
+        (index,) = points_in_boxes(torch.from_numpy(self.position), centre, size, heading)
+        return index.numpy()
 
     def without(self, index: np.ndarray) -> FreePoints:
         """Remove points by their indices."""

@@ -18,6 +18,7 @@ from pyarrow import feather
 from scenes import pose, rows_of
 from small_logs import make_small_drive
 from staged_cars import SIZE, Staged, straight
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, make_config, make_model, track
 from cflow_torch.applications import tracking
@@ -457,6 +458,38 @@ def test_boxes_are_tight_around_their_points() -> None:
         assert (inside[group == number] == 0).all()
         inside = box_of_point(points, centre[own], size[own] * 0.99, heading[own])
         assert (inside[group == number] == -1).sum() >= 4, "points on the faces"
+
+
+class LargestTensor(TorchDispatchMode):
+    """Note the largest number of values in a result of an operation."""
+
+    num_values = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        if isinstance(result, torch.Tensor):
+            self.num_values = max(self.num_values, result.numel())
+        return result
+
+
+def test_the_first_box_that_holds_a_point_is_found_with_memory_for_the_points_only() -> None:
+    random = np.random.default_rng(2)
+    points = random.uniform(-5, 5, (400, 3))
+    centre = random.uniform(-5, 5, (60, 3))
+    size = random.uniform(0.5, 4, (60, 3))
+    heading = random.uniform(-4, 4, 60)
+    with LargestTensor() as largest:
+        found = box_of_point(*map(torch.from_numpy, (points, centre, size, heading))).tolist()
+    assert largest.num_values <= 3 * len(points)
+    for point, box in zip(points, found):
+        offset = point - centre
+        along = np.cos(heading) * offset[:, 0] + np.sin(heading) * offset[:, 1]
+        across = np.cos(heading) * offset[:, 1] - np.sin(heading) * offset[:, 0]
+        is_inside = (np.abs(np.stack([along, across, offset[:, 2]], 1)) <= size / 2).all(1)
+        assert box == (is_inside.argmax() if is_inside.any() else -1)
+    assert len(set(found)) > 20
+    none = box_of_point(torch.from_numpy(points), *(torch.zeros(0, *shape).double() for shape in ((3,), (3,), ())))
+    assert (none == -1).all()
 
 
 def test_an_empty_table_comes_back_from_disk_and_a_broken_one_is_refused(tmp_path: Path) -> None:
