@@ -106,7 +106,7 @@ def _value_of_box(values: Tensor, box: Tensor, outside: float) -> Tensor:
 
 def match(tracks: TrackStates, points: Tensor, track_of_point: Tensor, groups: MovingGroups) -> TrackMatches:
     """Match tracks with a sweep, given the predicted points (P, 3) of the tracks and the track of each point."""
-    track, group = link(points, track_of_point, *groups.moving, _MIN_OVERLAP)
+    track, group = link(points, track_of_point, *groups.moving)
     may_have_stopped = tracks.is_confirmed.clone()
     may_have_stopped[track] = False
     candidate = may_have_stopped.nonzero()[:, 0]
@@ -123,13 +123,13 @@ def match(tracks: TrackStates, points: Tensor, track_of_point: Tensor, groups: M
     )
 
 
-def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float) -> tuple[Tensor, Tensor]:
+def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor) -> tuple[Tensor, Tensor]:
     """Match groups of two sweeps that share small voxels, one to one, then the remaining groups in larger voxels.
 
     Points are (N, 3) float64, metres. The points of the earlier sweep are already at their predicted positions in the
-    current one. The group of each point is (N,) int64, counted from 0. `min_share` is the smallest overlap of a match:
-    the intersection over union of the voxels of both groups. Returns the matched groups of the earlier and of the
-    current sweep, (K,) int64 each.
+    current one. The group of each point is (N,) int64, counted from 0. The voxels of two groups that match overlap
+    by `_MIN_OVERLAP` or more, as intersection over union. Returns the matched groups of the earlier and of the current
+    sweep, (K,) int64 each.
 
     Convention: greedy, the largest overlap first. Ties: the smaller earlier group, then the smaller current one.
     Cost: for each size of voxel, four sorts of the points.
@@ -137,7 +137,7 @@ def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_s
     matches: dict[int, int] = {}
     taken: set[int] = set()
     for side in VOXELS:
-        for earlier, current in _by_overlap(points0, group0, points1, group1, min_share, side):
+        for earlier, current in _by_overlap(points0, group0, points1, group1, side):
             if earlier not in matches and current not in taken:
                 matches[earlier] = current
                 taken.add(current)
@@ -145,9 +145,7 @@ def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_s
     return matched[:, 0], matched[:, 1]
 
 
-def _by_overlap(
-    points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float, side: float
-) -> list[list[int]]:
+def _by_overlap(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, side: float) -> list[list[int]]:
     """Pairs of groups (earlier, current) that share voxels of `side` metres, the largest overlap first."""
     if not (len(points0) and len(points1)):
         return []
@@ -163,7 +161,7 @@ def _by_overlap(
     earlier, current, _, shared = unique_pairs(group0.repeat_interleave(count), group1[concat_ranges(begin, count)])
     share = shared / (torch.bincount(group0)[earlier] + torch.bincount(group1)[current] - shared)
     order = share.argsort(descending=True, stable=True)
-    order = order[share[order] >= min_share]
+    order = order[share[order] >= _MIN_OVERLAP]
     return torch.stack([earlier[order], current[order]], 1).tolist()  # type: ignore[no-any-return]
 
 

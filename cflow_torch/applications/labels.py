@@ -15,7 +15,7 @@ from typing import Any, Callable, Iterable, Iterator, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.applications.moving_groups import MOVING, pose_of
+from cflow_torch.applications.moving_groups import MOVING, pose_of, world_points
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5.writer import write_hdf5_labels
 from cflow_torch.data.log import CachedLog, Log, window
@@ -186,8 +186,7 @@ def _dynamic_points(sweep: Sweep, other: Sweep, result: FlowResult, seconds: np.
     interval = seconds[1] - seconds[0]  # negative where the flow leads to the sweep before
     velocity = residual[rows] @ pose_of(other)[:3, :3].T / interval
     confidence = as_numpy(result.confidence, np.float64)[rows]  # type: ignore[arg-type]  # checked before
-    positions = transform_points(as_numpy(sweep.points)[rows, :3], pose_of(sweep))
-    return DynamicPoints(rows, positions, velocity, group[rows], confidence, float(seconds[0]))
+    return DynamicPoints(rows, world_points(sweep, rows), velocity, group[rows], confidence, float(seconds[0]))
 
 
 def _is_confirmed(dynamic: Sequence[DynamicPoints], trees: Sequence[Any], index: int) -> np.ndarray:

@@ -11,10 +11,9 @@ from torch import Tensor
 from cflow_torch.applications.association import MARGIN, MIN_STOPPED_SHARE, enclosing_boxes, points_in_boxes
 from cflow_torch.applications.completion import TrackedPoints
 from cflow_torch.applications.floor import Floor
-from cflow_torch.applications.moving_groups import MIN_POINTS, pose_of
+from cflow_torch.applications.moving_groups import MIN_POINTS, pose_of, world_points
 from cflow_torch.applications.static_places import cells_of
 from cflow_torch.applications.track_table import Table
-from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep, as_numpy
 
 
@@ -31,7 +30,7 @@ class FreePoints(NamedTuple):
         is_free = is_valid & np.isfinite(cloud).all(axis=1)
         is_free[taken] = False
         row = np.flatnonzero(is_free)
-        position = transform_points(cloud[row], pose_of(sweep))
+        position = world_points(sweep, row)
         order = np.argsort(position[:, 0])
         return cls(row[order], position[order])
 

@@ -437,13 +437,13 @@ def test_matches_equal_those_of_plain_loops() -> None:
                 (-len(a & b) / len(a | b), i, j)
                 for i, a in voxels[0].items()
                 for j, b in voxels[1].items()
-                if a & b and len(a & b) / len(a | b) >= 0.05
+                if a & b and len(a & b) / len(a | b) >= 0.1
             ]
             for _, i, j in sorted(shares):
                 if i not in expected and j not in expected.values():
                     expected[i] = j
         given = [torch.from_numpy(value) for value in (clouds[0], groups[0], clouds[1], groups[1])]
-        earlier, later = link(*given, 0.05)
+        earlier, later = link(*given)
         assert dict(zip(earlier.tolist(), later.tolist())) == expected
 
 
