@@ -513,13 +513,13 @@ def test_tracks_are_written_as_text(tmp_path: Path) -> None:
     """A car that drives to the left of a vehicle that has turned by 90 degrees to the left: ahead of the vehicle."""
     log = Staged([straight((-12, 0), (0.0, 0.9))], np.tile(pose(-20, -5, np.pi / 2, 1), (12, 1, 1)))
     table = track(log, log.results())
-    write_mot(tmp_path / "mot.txt", table, log)
+    write_mot(tmp_path, table, log)
     mot = np.loadtxt(tmp_path / "mot.txt", delimiter=",", ndmin=2)
     assert np.array_equal(mot[:, :6], [[frame, 1, -1, -1, -1, -1] for frame in range(1, 13)])
     assert np.allclose(mot[:, 6], 0.9)
     assert np.allclose(mot[:, 7:], np.stack([table[axis] for axis in "xyz"], 1), atol=1e-3)
 
-    write_kitti(tmp_path / "kitti.txt", table, log)
+    write_kitti(tmp_path, table, log)
     lines = [line.split() for line in (tmp_path / "kitti.txt").read_text().splitlines()]
     assert [line[:5] for line in lines] == [[str(index), "0", "Car", "-1", "-1"] for index in range(12)]
     height, width, length, x, y, z, rotation, score = np.array([line[10:] for line in lines], float).T
@@ -550,7 +550,7 @@ def test_tracks_of_a_calibrated_drive_are_in_the_frame_of_kittis_labels(tmp_path
     vehicle = np.tile(pose(0, -20, np.pi / 2, 1), (12, 1, 1))
     log = Calibrated([straight((-8, 0), (1.6, 0.0)), straight((-8, -50), (0.9, 0.0))], vehicle)
     table = track(log, log.results())
-    write_kitti(tmp_path / "kitti.txt", table, log)
+    write_kitti(tmp_path, table, log)
     numbers = np.array([line.split()[5:] for line in (tmp_path / "kitti.txt").read_text().splitlines()], float)
     middle = log.middle(0)
     u = 620 + 720 * (middle[:, 0] + 0.07) / (middle[:, 1] + 20 - 0.27)
@@ -570,7 +570,7 @@ def test_tracks_of_a_calibrated_drive_are_in_the_frame_of_kittis_labels(tmp_path
 def test_the_rectangle_of_a_car_that_reaches_behind_the_camera_is_cut_off_by_the_image(tmp_path: Path) -> None:
     """A car overtakes on the left: its front is ahead of the camera while its rear is behind."""
     log = Calibrated([straight((-1.5, -30), (0.0, 0.9), 14)], np.tile(pose(0, -20, np.pi / 2, 1), (14, 1, 1)))
-    write_kitti(tmp_path / "kitti.txt", track(log, log.results()), log)
+    write_kitti(tmp_path, track(log, log.results()), log)
     lines = [line.split() for line in (tmp_path / "kitti.txt").read_text().splitlines()]
     rectangles = {int(line[0]): np.array(line[6:10], float) for line in lines}
     for sweep in (9, 10, 11):
@@ -610,11 +610,11 @@ def test_tracks_are_written_for_the_loaders_of_drivestudio(tmp_path: Path) -> No
     log = Staged([straight((0, -6), (0.8, 0.0)), hidden], np.tile(pose(-20, -5, np.pi / 2, 1), (12, 1, 1)))
     table = track(log, log.results())
     table["id"] = table["id"] * 3 + 5  # ids have gaps, because most tracks are not confirmed
-    write_drivestudio(tmp_path / "instances", table, log, "vehicle.car")
+    write_drivestudio(tmp_path / "instances", table, log, "nuscenes")
     poses, sizes, classes = read_instances(tmp_path / "instances")
     assert poses.shape[:2] == (12, 2) and classes == ["vehicle.car"] * 2
     person = {**table, "class": np.where(table["id"] == table["id"].max(), "pedestrian", "truck")}
-    write_drivestudio(tmp_path / "people", person, log, "vehicle.car", "vehicle.bicycle")
+    write_drivestudio(tmp_path / "people", person, log, "nuscenes")
     assert read_instances(tmp_path / "people")[2] == ["vehicle.car", "vehicle.bicycle"]
     assert np.isfinite(poses[:, :, 0, 0]).sum(0).tolist() == [12, 8]
     middle = np.stack([log.middle(car) for car in range(2)], 1)
