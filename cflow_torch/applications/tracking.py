@@ -82,9 +82,10 @@ class Tracker:
     """Track moving objects sweep by sweep.
 
     The flow moves the points of a group to the next sweep. There, the group that shares the most voxels with them is
-    the same object. We track a stopped object as long as there are points in its box. If an object is not seen for up
-    to three sweeps, we predict its position from its velocity. We do the same if sweeps are missing, for up to three
-    intervals or one second, whichever is longer. Memory: the points of the current tracks.
+    the same object. We track a stopped object as long as its box holds at least 5 static points, and 0.3 of those that
+    it had. If an object is not seen for up to three sweeps, we predict its position from its velocity. We do the same
+    if sweeps are missing, for up to three intervals or one second, whichever is longer. Memory: the points of the
+    current tracks.
 
     Args:
         sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.

@@ -519,10 +519,10 @@ class Clean(Command):
 
     data=arrays reads such a folder. A point is dynamic if its flow is at least 0.05 m per sweep. With the presets
     default, offline and live, its P(moving) must also be at least 0.5. Clouds of a folder keep their names, columns and
-    types, and poses in VIEWPOINT. We also keep the other columns of bags, Argoverse 2 and PandaSet, such as intensity.
-    removed/NAME.npy has a bool per point of a sweep, True = not in the clean cloud, and clean.json the settings. All
-    files of a log are in its folder, which is written as a whole or not at all. Run the command again to write the
-    missing logs. Other files in OUTPUT stay.
+    types, and poses in VIEWPOINT; those of other data sets have the numbers of their sweeps. We also keep the other
+    columns of bags, Argoverse 2 and PandaSet, such as intensity. removed/NAME.npy has a bool per point of a sweep, True
+    = not in the clean cloud, and clean.json the settings. All files of a log are in its folder, which is written as a
+    whole or not at all. Run the command again to write the missing logs. Other files in OUTPUT stay.
 
     examples:
       cflow clean /data/drive map=true voxel_size=0.2            any recognised format, such as a bag
