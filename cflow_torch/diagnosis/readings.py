@@ -410,33 +410,35 @@ def _motion_of(pair: Pair, scan: str) -> np.ndarray:
 def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:
     """Return the scan under which the world stands still, and the shares of those that were compared.
 
-    The instant of a sweep is when the LiDAR looks ahead. If no such scan is clearly better than as given, it may be the
-    start or the end of a turn, which shows where the motion changes.
+    Points with times may be compensated already, or their times may be wrong: then we compare directions with the
+    better of both. The instant of a sweep is when the LiDAR looks ahead. If no such scan is clearly better, and points
+    have no times, it may be the start or the end of a turn, which shows where the motion changes.
     """
-    expected, first, *_ = pairs[0].scans
-    ahead, *others = INSTANTS
-    result = _best_direction(pairs, ahead)
-    shows_instants = any(name in pair.transforms for pair in pairs for name in HALVES)
-    if result[0] != expected or first not in DIRECTIONS or not shows_instants:
-        return result
-    found = [_best_direction(pairs, instant) for instant in others]
-    scan, shares = max(found, key=lambda each: each[1][each[0]])
-    return (scan, shares) if scan != expected else result
+    expected, *others = [scan for scan in pairs[0].scans if scan not in DIRECTIONS]
+    scan, of_times = _best_of(pairs, expected, others) if others else (expected, {})
+    turned = [pair for pair in pairs if any(direction in pair.scans for direction in DIRECTIONS)]
+    if not turned:
+        return scan, of_times
+    ahead, *instants = INSTANTS
+    found, shares = _best_of(turned, scan, [direction + ahead for direction in DIRECTIONS])
+    if found == scan and not others and any(name in pair.transforms for pair in turned for name in HALVES):
+        of_instants = [_best_of(turned, scan, [name + instant for name in DIRECTIONS]) for instant in instants]
+        best, of_best = max(of_instants, key=lambda each: each[1][each[0]])
+        found, shares = (best, of_best) if best != scan else (found, shares)
+    return found, {**of_times, **shares}
 
 
-def _best_direction(pairs: Sequence[Pair], instant: str) -> tuple[str, dict[str, float]]:
-    """Return the best scan of an instant, one of `INSTANTS`, and the shares of those that were compared.
+def _best_of(pairs: Sequence[Pair], expected: str, others: Sequence[str]) -> tuple[str, dict[str, float]]:
+    """Return the best of scans, and the shares of those that were compared.
 
-    Points with times may be compensated already, so we move them only if they then fit at least as well. If a direction
-    fits better than its opposite, turns may begin behind the vehicle or elsewhere: we choose behind, unless another
-    start is clearly better. If the structure is shifted along the path, less of it must be in place: along smooth walls
-    this is not so.
+    Points with times that are expected are moved by these if they then fit at least as well. If a direction fits better
+    than its opposite, turns may begin behind the vehicle or elsewhere: we choose behind, unless another start is
+    clearly better. If the structure is shifted along the path, less of it must be in place: along smooth walls this is
+    not so.
     """
-    expected, *others = pairs[0].scans
-    others = [scan + instant for scan in others]
     of_pairs = [pair.shares_of_scans((expected, *others)) for pair in pairs]
     shares, clear = _compare(of_pairs, expected)
-    if expected == TIMES:
+    if expected == TIMES and OFF in others:
         return max(shares, key=shares.__getitem__), shares  # ties: the times
     best, *opposite = sorted(others, key=shares.__getitem__, reverse=True)
     if best in SCANS and shares[best] >= _TURN * max(shares[scan] for scan in opposite):
