@@ -432,7 +432,7 @@ def _sensor(log: _CheckedLog) -> list[Finding]:
     points = as_numpy(sweep.points)[:, :3].astype(np.float64)
     kept = points[np.isfinite(points).all(1)]
     distance = np.linalg.norm(kept, axis=1)
-    parts = [f"{len(log.timestamps)} sweeps", f"{len(points):,} points in {_name_of(index)}"]
+    parts = [f"{len(log.timestamps)} sweeps", f"{len(points):,} points in {_name_of(index) if index else 'the first'}"]
     if len(kept) < len(points):
         parts.append(f"{len(points) - len(kept):,} of them not finite")
     if len(kept):

@@ -425,7 +425,7 @@ def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:
         of_instants = [_best_of(turned, scan, [name + instant for name in DIRECTIONS]) for instant in instants]
         best, of_best = max(of_instants, key=lambda each: each[1][each[0]])
         found, shares = (best, of_best) if best != scan else (found, shares)
-    return found, {**of_times, **shares}
+    return found, {**of_times, **shares} if found != scan else of_times or shares
 
 
 def _best_of(pairs: Sequence[Pair], expected: str, others: Sequence[str]) -> tuple[str, dict[str, float]]:
