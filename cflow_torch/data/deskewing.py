@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, Finding
-from cflow_torch.data.log import FlowLabels, Log, LogWrapper, intervals_of
+from cflow_torch.data.log import FlowLabels, Log, LogWrapper, intervals_of, typical_sweeps
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.diagnosis.readings import Judgement
 from cflow_torch.transforms import poses_at, relative_transform, transform_each, transform_points
@@ -97,10 +97,10 @@ class DeskewedLog(LogWrapper):
         own = self.log.unwrapped
         if own.is_compensated or self.poses is None:
             return ("off",)
-        times = self.log.sweep(0).point_times
+        times = self.log.sweep(typical_sweeps(self.log)[0]).point_times
         if times is None or not len(times) or np.ptp(as_numpy(times)) == 0:  # equal times do not say anything
             return ("off", *DIRECTIONS)
-        return ("times", "off") if own.has_raw_times else ("off", "times")
+        return ("times", "off", *DIRECTIONS) if own.has_raw_times else ("off", "times", *DIRECTIONS)
 
     def _place(self, index: int, sweep: Sweep, rows: np.ndarray, scan: str) -> np.ndarray:
         points = as_numpy(sweep.points)[rows, :3].astype(np.float64)

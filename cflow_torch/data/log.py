@@ -15,7 +15,7 @@ from cflow_torch.data.finding import Finding
 from cflow_torch.diagnosis.readings import LEAST_DISTANCE, Judgement, is_around
 from cflow_torch.errors import MissingFile, warn
 from cflow_torch.transforms import poses_at
-from cflow_torch.types import CFlowError, Sweep, Window, check_array
+from cflow_torch.types import CFlowError, Sweep, Window, as_numpy, check_array
 
 _GAP, _LONGEST_STEP = 2.5, 0.45  # a gap is longer than so many usual intervals, and seconds
 _Log = TypeVar("_Log", bound="Log")
@@ -293,6 +293,21 @@ def poses_beyond(log: Log, poses: np.ndarray, count: int) -> tuple[np.ndarray, i
     before, after = before[before >= known[0]], after[after <= known[-1]]
     sides = [poses_at(times, known, driven) if len(times) else poses[:0] for times in (before, after)]
     return np.concatenate([sides[0], poses, sides[1]]), len(before)
+
+
+def typical_sweeps(log: Log) -> list[int]:
+    """Return those of the first, middle and last sweep that can be read, and have most of the points; [0] = none can.
+
+    A recording may begin and end within a turn of its LiDAR.
+    """
+    num_points = {}
+    for index in sorted({0, (len(log.timestamps) - 1) // 2, len(log.timestamps) - 1}):
+        try:
+            num_points[index] = int(np.isfinite(as_numpy(log.sweep(index).points)[:, 0]).sum())
+        except (CFlowError, OSError):
+            continue
+    most = max(num_points.values(), default=0)
+    return [index for index, count in num_points.items() if count >= most / 2] or [0]
 
 
 def intervals_of(log: Log) -> np.ndarray | None:

@@ -8,12 +8,12 @@ from typing import Callable, Iterable, List
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
-from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses
+from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses, typical_sweeps
 from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, judge_log
 from cflow_torch.data.neighbours import Neighbours, middle_sweeps
 from cflow_torch.data.read_as import ReadAs, begins_late
-from cflow_torch.diagnosis.conventions import OF_POINTS, READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
-from cflow_torch.diagnosis.inspection import repeats
+from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
+from cflow_torch.diagnosis.inspection import mask_problem, repeats
 from cflow_torch.diagnosis.point_frame import frame_problem
 from cflow_torch.diagnosis.readings import (
     EQUAL,
@@ -26,12 +26,10 @@ from cflow_torch.diagnosis.readings import (
 )
 from cflow_torch.diagnosis.stillness import IN_PLACE, LEAST_SHARE, Structure, are_finite, share_of_sweeps
 from cflow_torch.errors import CFlowError, warn
-from cflow_torch.ground.segmentation import find_ground
 from cflow_torch.transforms import relative_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
 
 _CACHED = 12  # sweeps that several checks read
-_MISFIT = 0.3  # correlation of a ground mask with the ground that we find; of right ones, 0.87 to 0.97
 _STRIP = 4.0  # metres, half width of the strip whose points are looked for in the next sweep
 _SAMPLE = 1000  # points of the strip that are looked for
 _SAME = 0.001  # metres between two equal points
@@ -66,11 +64,24 @@ _TWO_SENSORS = Finding(
     True,
 )
 _OF_SPARSE_POSES = "its poses are interpolated over several sweeps, which data.odometry=refine corrects"
+_UNITS_OF_POINTS = [f"points_{unit}" for unit in UNITS]
 _NUM_SWEEPS = {name: 0.5 if name in HALVES else int(name.partition("_")[2] or 1) for name in TIMES_OF_POSES}
 
 
 class _CheckedLog(CachedLog):
     """A log with what several checks ask."""
+
+    @cached_property
+    def typical(self) -> list[int]:
+        return typical_sweeps(self)
+
+    @cached_property
+    def frame(self) -> tuple[str, str]:
+        """The reading that corrects the points, and what is wrong with them; both "" if nothing is."""
+        reading, problem = frame_problem(self.sweep(self.typical[0]).points)
+        if not problem and begins_late(self):
+            problem = "the first column does not seem to be x: give x, y, z first, and then others such as intensity"
+        return reading, problem
 
     @cached_property
     def motion(self) -> Judgement:
@@ -151,26 +162,26 @@ def _found(log: Log) -> list[Finding]:
 
 
 def _frame(log: _CheckedLog) -> list[Finding]:
-    """Check the first sweep; without poses also the last one, which is far away if points are in the world's frame.
+    """Check a typical sweep; without poses also the last one, which is far away if points are in the world's frame.
 
     Then check the ego motion in the frame that the points will have.
     """
-    reading, problem = _problem_of(log, 0)
-    where = "first"
+    reading, problem = log.frame
+    where = _name_of(log.typical[0])
     if not problem and known_poses(log) is None:
-        where, problem = "last", frame_problem(log.sweep(len(log.timestamps) - 1).points)[1]
+        where, problem = "the last sweep", frame_problem(log.sweep(log.typical[-1]).points)[1]
     if not problem:
         right = Finding("frame", RIGHT, "metres, around the vehicle, z up", True)
         return [right, *_motion(log, "")]
-    units = [f"points_{unit}" for unit in UNITS]
     # The unit under which the points fit the poses may be another one.
-    unit, _ = _fitting(log, [reading, *units]) if reading in units and known_poses(log) is not None else ("", 0)
+    is_unit = reading in _UNITS_OF_POINTS and known_poses(log) is not None
+    unit, _ = _fitting(log, [reading, *_UNITS_OF_POINTS]) if is_unit else ("", 0)
     if unit not in ("", reading):
         reading, problem = unit, f"{READINGS[unit].cause}, because the motion then fits that of the poses"
     fix = f"; {_setting(log, reading)} converts them" if reading else ""
-    wrong = Finding("frame", WRONG, f"in the {where} sweep {problem}{fix}", True)
+    wrong = Finding("frame", WRONG, f"in {where} {problem}{fix}", True)
     # In another frame that we do not know, readings of the poses mean nothing.
-    return [wrong, *(_motion(log, reading) if reading or where == "last" else [])]
+    return [wrong, *(_motion(log, reading) if reading or where == "the last sweep" else [])]
 
 
 def _fitting(log: Log, readings: Iterable[str]) -> tuple[str, float]:
@@ -187,13 +198,6 @@ def _fitting(log: Log, readings: Iterable[str]) -> tuple[str, float]:
     return next(fitting, ("", 0.0))
 
 
-def _problem_of(log: Log, index: int) -> tuple[str, str]:
-    reading, problem = frame_problem(log.sweep(index).points)
-    if not problem and begins_late(log):
-        problem = "the first column does not seem to be x: give x, y, z first, and then others such as intensity"
-    return reading, problem
-
-
 def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     """Check the ego motion of a log whose points are converted by a reading; "" = they are right."""
     # The poses are judged in the frame that the points will have.
@@ -205,7 +209,7 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     if has_poses and judgement.best and checked.misfit:
         return checked.misfit
     if NO_READING in judgement.best and has_poses:
-        fitting, share = _fitting(log, (REVERSED, *OF_POINTS))
+        fitting, share = _fitting(log, (REVERSED, *_UNITS_OF_POINTS))
         if fitting:
             shares = f"{judgement.given:.2f} of the static structure is in place as given, {share:.2f} then"
             text = f"{READINGS[fitting].cause} ({shares}): give {_setting(log, fitting)}"
@@ -221,7 +225,8 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
         why, fix = "", _OF_SPARSE_POSES
     elif name == NO_READING:
         why, fix = "", "check that the points are x, y, z in metres, and "
-        fix += "that the poses belong to this log, their times, units and quaternions" if has_poses else "pass poses"
+        of_poses = "that the poses belong to this log and are of the points' frame (else give data.ego_T_lidar), "
+        fix += f"{of_poses}their times, units and quaternions" if has_poses else "pass poses"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
         fix = " or ".join(judgement.reading(each).fix or _setting(log, each) for each in judgement.best)
@@ -271,49 +276,30 @@ def _lapses(log: _CheckedLog) -> list[Finding]:
     return [Finding("poses", WRONG, f"{', '.join(texts)}: {fix}", True)]
 
 
-def _mask(log: Log) -> list[Finding]:
-    sweep = log.sweep(0)
-    if sweep.is_ground is None:
+def _mask(log: _CheckedLog) -> list[Finding]:
+    masks = {index: log.sweep(index).is_ground for index in log.typical}
+    known = [index for index, mask in masks.items() if mask is not None]
+    if not known:
         return [Finding("ground", RIGHT, "no masks, so no point is taken for ground (data.find_ground=grid finds it)")]
-    mask = as_numpy(sweep.is_ground)
+    for index in known:
+        problem = "" if log.frame[1] else mask_problem(log.sweep(index))
+        if problem:
+            return [Finding("ground", WRONG, f"the mask of {_name_of(index)} is {problem}", True)]
+    mask = as_numpy(masks[known[0]])
     share = float(mask.mean()) if len(mask) else 0.0
-    text = f"{100 * share:.0f} % of the points of the first sweep"
-    problem = _problem_of_mask(log, mask, share)
-    if problem:
-        return [Finding("ground", WRONG, f"{text}, {problem}", True)]
-    return [Finding("ground", RIGHT, text, True)]
+    return [Finding("ground", RIGHT, f"{100 * share:.0f} % of the points of {_name_of(known[0])}", True)]
 
 
-def _problem_of_mask(log: Log, mask: np.ndarray, share: float) -> str:
-    """Return what is wrong with the ground mask of the first sweep; "" = nothing, or it cannot be compared."""
-    if share == 1:
-        return "so no point would have flow: give masks of the ground alone, or none"
-    if share == 0 or _problem_of(log, 0)[1]:
-        return ""
-    fit = _fit_of_mask(as_numpy(log.sweep(0).points)[:, :3], mask)
-    if fit > _MISFIT:
-        return ""
-    fix = "invert the mask, True = ground" if fit < -_MISFIT else "has it the rows of this sweep, in their order?"
-    return f"which are not those that lie low: {fix}"
+def _name_of(index: int) -> str:
+    return f"sweep {index}" if index else "the first sweep"
 
 
-def _fit_of_mask(points: np.ndarray, mask: np.ndarray) -> float:
-    """Return the correlation of a ground mask with the ground that we find; 1 if that is none, or all points."""
-    rows = slice(None, None, len(points) // _MOST_SEEN + 1)
-    found = as_numpy(find_ground(points[rows]))
-    is_known = are_finite(points[rows])
-    if not is_known.any():
-        return 1.0
-    both = np.stack([found[is_known], mask[rows][is_known]]).astype(np.float64)
-    return float(np.corrcoef(both)[0, 1]) if (np.ptp(both, axis=1) > 0).all() else 1.0
-
-
-def _repeated(log: Log) -> list[Finding]:
+def _repeated(log: _CheckedLog) -> list[Finding]:
     first = [log.sweep(index) for index in range(2)]
     if repeats(*first):
         text = "sweep 1 repeats the points of sweep 0: leave one out, or copy its file again"
         return [Finding("sweeps", WRONG, text, True)]
-    is_known = _is_grid(first[0]) or bool(frame_problem(first[0].points)[0])  # then "to the millimetre" means nothing
+    is_known = _is_grid(first[0]) or bool(log.frame[0])  # then "to the millimetre" means nothing
     again = 0.0 if is_known else _share_again(*first)
     if again > _ACCUMULATED:
         text = f"{100 * again:.0f} % of the points of the first sweep are also in the second one, to the millimetre"
@@ -440,12 +426,13 @@ def _misplaced(log: _CheckedLog, neighbours: Neighbours) -> list[Finding]:
     return findings
 
 
-def _sensor(log: Log) -> list[Finding]:
-    sweep = log.sweep(0)
+def _sensor(log: _CheckedLog) -> list[Finding]:
+    index = log.typical[0]
+    sweep = log.sweep(index)
     points = as_numpy(sweep.points)[:, :3].astype(np.float64)
     kept = points[np.isfinite(points).all(1)]
     distance = np.linalg.norm(kept, axis=1)
-    parts = [f"{len(log.timestamps)} sweeps", f"{len(points):,} points in the first"]
+    parts = [f"{len(log.timestamps)} sweeps", f"{len(points):,} points in {_name_of(index) if index else 'the first'}"]
     if len(kept) < len(points):
         parts.append(f"{len(points) - len(kept):,} of them not finite")
     if len(kept):
@@ -453,7 +440,7 @@ def _sensor(log: Log) -> list[Finding]:
         beams, spacing = _beams(kept)
         parts += [f"about {beams} beams"] if beams else []
         parts += [f"{spacing:.2f} degrees between points"] if spacing else []
-    columns = sorted(log.columns(0))
+    columns = sorted(log.columns(index))
     parts += [f"columns {', '.join(columns)}"] if columns else []
     return [Finding("sensor", RIGHT, ", ".join(parts))]
 

@@ -206,13 +206,12 @@ def _make_pairs(
     for first, second in chosen:
         start = max(first - _REACH, -num_before)
         around = None if extended is None else extended[start + num_before : second + num_before + _REACH + 1]
-        least = _LEAST_TIMED if TIMES in scans else _LEAST_SPEED
-        is_fast = False
+        speed = 0.0
         if poses is not None:
-            motion = np.linalg.inv(poses[second]) @ poses[first]
-            is_fast = bool(difference(motion, np.eye(4)) >= least * (second - first))
+            speed = float(difference(_motions(poses, first, second), np.eye(4))) / (second - first)
+        least = {OFF: _LEAST_TIMED, TIMES: _LEAST_TIMED}
+        shown = [scan for scan in scans if scan == scans[0] or speed >= least.get(scan, _LEAST_SPEED)]
         how = {} if deskew is None else {"deskew": [partial(deskew, index) for index in (first, second)]}
-        shown = scans if is_fast else scans[:1]
         rows = (0, 1) if around is None else (first - start, second - start)
         yield make_pair(sweeps[first], sweeps[second], around, rows, in_world, scans=shown, **how)
 

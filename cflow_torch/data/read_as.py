@@ -8,8 +8,8 @@ from typing import Any, Sequence
 
 import numpy as np
 
-from cflow_torch.data.finding import FOUND, RIGHT, Finding
-from cflow_torch.data.log import FlowLabels, Log, LogWrapper, known_poses, poses_beyond
+from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
+from cflow_torch.data.log import FlowLabels, Log, LogWrapper, known_poses, poses_beyond, typical_sweeps
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.data.odometry import PosedLog
 from cflow_torch.diagnosis.conventions import LATEST, OF_POINTS, READINGS, REVERSED, TIMES_OF_POSES, WORLD
@@ -20,6 +20,7 @@ from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
 
 _LEAST_HEIGHT = 0.5  # metres that nine tenths of the heights span, if they are heights
+_COARSEST = 0.01  # metres between two float32 coordinates
 READ_AS = ("auto", None, *READINGS)
 
 
@@ -74,14 +75,25 @@ def _is_in_world(log: Log) -> bool:
 
 def begins_late(log: Log) -> bool:
     """Test whether clouds have another column before x, y and z: the second to fourth have ground, the others none."""
-    columns = as_numpy(log.sweep(0).points)[:, :3]
+    index = typical_sweeps(log)[0]
+    columns = as_numpy(log.sweep(index).points)[:, :3]
     known = columns[np.isfinite(columns[:, 0]), 0]
     if not len(known) or known.min() < 0 or has_ground(columns):
         return False
-    fourth = log.columns(0).get("column_3", np.zeros(0))
+    fourth = log.columns(index).get("column_3", np.zeros(0))
     if len(fourth) != len(columns) or np.ptp(np.quantile(fourth, (0.05, 0.95))) < _LEAST_HEIGHT:
         return False
     return has_ground(np.column_stack([columns[:, 1:], fourth]).astype(np.float32))
+
+
+def _coarse_coordinates(log: Log) -> list[Finding]:
+    """Tell coordinates of a map that are too large for float32."""
+    points = as_numpy(log.sweep(typical_sweeps(log)[0]).points)[:, :3]
+    step = float(np.spacing(np.nanmax(np.abs(points), initial=0).astype(np.float32)))
+    if points.dtype != np.float32 or not step > _COARSEST:
+        return []
+    text = f"the points are float32 with steps of {step:.2g} m, as they are far from the origin of the world"
+    return [Finding("frame", WRONG, f"{text}: give points and poses relative to a place nearby", True)]
 
 
 class ReadAs(LogWrapper):
@@ -122,7 +134,8 @@ class ReadAs(LogWrapper):
         said = Finding("frame", RIGHT, f"as you say, {what} (read_as={self.reading})")
         used = f"we move them to that of the vehicle. data.read_as={self.reading} does the same without this line"
         found = Finding("frame", FOUND, f"{what}, so {used}", True)
-        return [*self.log.findings(), found if self.is_reading_found else said]
+        coarse = [] if self.reading != WORLD else _coarse_coordinates(self.log)
+        return [*self.log.findings(), found if self.is_reading_found else said, *coarse]
 
     @cached_property
     def poses(self) -> np.ndarray | None:

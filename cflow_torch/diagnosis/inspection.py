@@ -11,9 +11,9 @@ from cflow_torch.config import Config
 from cflow_torch.diagnosis.conventions import INVERTED, STILL, WORLD
 from cflow_torch.diagnosis.point_frame import frame_problem
 from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, judge, make_pair
-from cflow_torch.diagnosis.stillness import LEAST_SHARE, MISPLACED, share_of_sweeps
+from cflow_torch.diagnosis.stillness import LEAST_SHARE, MISPLACED, are_finite, share_of_sweeps
 from cflow_torch.errors import warn
-from cflow_torch.ground.segmentation import has_ground
+from cflow_torch.ground.segmentation import find_ground, has_ground
 from cflow_torch.types import MOVING, Array, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import have_same_points
@@ -21,10 +21,11 @@ from cflow_torch.windows.validation import have_same_points
 REPEATED = "pc1 has the same points as pc0, so everything seems to move with the sensor: give two different sweeps"
 _EMPTY = "pc1 has no finite points, so everything in pc0 seems to vanish: give the points of the next sweep"
 _GROUND = (
-    "a sweep without a ground mask contains ground, which joins the objects on it into one cluster, so moving objects "
-    "are missed: give masks (Sweep.is_ground, see cflow_torch.ground.find_ground), all False if this is "
-    "not ground"
+    "contains ground, which joins the objects on it into one cluster, so moving objects are missed: give masks of the "
+    "ground (Sweep.is_ground, see cflow_torch.ground.find_ground)"
 )
+_MISFIT = 0.3  # correlation of a ground mask with the ground that we find; of right ones, 0.87 to 0.97
+_MOST_MASKED = 20_000  # points of a ground mask that are compared
 # What to do about a `Judgement` of two sweeps, by the first of its best readings.
 _ADVICE = {
     INVERTED: "poses must be T_world_ego, and T_ego1_ego0 maps from t to t+1",
@@ -35,6 +36,10 @@ _ADVICE = {
     NO_READING: "check frame, units and times of the poses (T_ego1_ego0)",
 }
 _ADVICE_ELSE = "convert the poses (T_ego1_ego0) to the frame of the points, in metres"
+_HISTORY = (
+    "the first sweep of the history does not fit pc0, which fits pc1, so it has points or a pose of another time: give "
+    "the sweeps before pc0 with their own poses, the nearest first"
+)
 _OTHER_TIME = (
     "the second sweep does not fit the first one, which fits those before, so it has points or a pose of another time, "
     "or sweeps are interchanged"
@@ -49,7 +54,8 @@ class Inspection:
 
     In every window, it checks that pc1 has points, other than pc0. It makes the other checks once each, only in the
     first window of a call. Once such a window has points, it checks units, axes, ground and missing returns. Once such
-    a window has static structure, it checks the ego motion. Cost: about 60 ms, once; 0.1 ms for each window.
+    a window has static structure, it checks the ego motion, and whether the history fits. Cost: about 100 ms, once;
+    0.1 ms for each window.
     """
 
     def __init__(self) -> None:
@@ -66,10 +72,15 @@ class Inspection:
             self._has_seen_points = True
             _, problem = frame_problem(first.pc0.points)
             if problem:
-                warn(problem)
                 self._has_seen_structure = True  # in another frame, readings of the poses mean nothing
-            elif first.pc0.is_ground is None and has_ground(first.pc0.points):
-                warn(_GROUND)
+            elif first.pc0.is_ground is None:
+                missed = f"a sweep without a ground mask {_GROUND}, all False if this is not ground"
+                problem = missed if has_ground(first.pc0.points) else ""
+            elif as_numpy(first.pc0.is_ground).any():  # else you say that there is no ground
+                problem = mask_problem(first.pc0)
+                problem = problem and f"the ground mask of pc0 is {problem}"
+            if problem:
+                warn(problem)
             _, num_missing = without_missing(first.pc0)
             if num_missing:
                 warn(f"{num_missing} {MISSING}: leave them out, or make them NaN")
@@ -78,6 +89,27 @@ class Inspection:
             self._has_seen_structure = bool(judgement.shares)
             if judgement.best:
                 warn(f"{judgement}: {_ADVICE.get(judgement.best[0], _ADVICE_ELSE)}")
+            elif first.pch and _fits_only(first.pc0, first.pc1, first.pch[0]):
+                warn(_HISTORY)
+
+
+def mask_problem(sweep: Sweep) -> str:
+    """Return what is wrong with the ground mask of a sweep in metres and z up; "" = nothing. Cost: 10 ms."""
+    rows = slice(None, None, len(sweep.points) // _MOST_MASKED + 1)
+    points = as_numpy(sweep.points)[rows, :3]
+    mask = as_numpy(sweep.is_ground)[rows]
+    if len(mask) and mask.all():
+        return "that of all points, so no point would have flow: give masks of the ground alone, or none"
+    found = as_numpy(find_ground(points))
+    if not mask.any():
+        return f"empty, but the sweep {_GROUND}, or none" if found.any() else ""
+    is_known = are_finite(points)
+    both = np.stack([found, mask])[:, is_known].astype(np.float64)
+    fit = float(np.corrcoef(both)[0, 1]) if (np.ptp(both, axis=1) > 0).all() else 1.0
+    if fit > _MISFIT:
+        return ""
+    fix = "invert the mask, True = ground" if fit < -_MISFIT else "has it the rows of this sweep, in their order?"
+    return f"not that of points that lie low: {fix}"
 
 
 class MotionWatch:
@@ -97,18 +129,17 @@ class MotionWatch:
             return ""
         moves = torch.linalg.vector_norm(result.residual_flow, dim=1) >= MOVING
         share = int((moves & result.is_valid).sum()) / count
-        if self._usual is not None and share > _SUSPICIOUS * (self._usual + _SLACK) and _misses_next(window):
+        is_suspicious = self._usual is not None and share > _SUSPICIOUS * (self._usual + _SLACK)
+        if is_suspicious and window.pch and _fits_only(window.pc0, window.pch[0], window.pc1):
             return f"{share:.0%} of the points move, {self._usual:.0%} in the pair before: {_OTHER_TIME}"
         self._usual = share
         return ""
 
 
-def _misses_next(window: Window) -> bool:
-    """Test whether pc0 fits the sweep before it, but not pc1."""
-    if not window.pch:
-        return False
-    before, next_one = (share_of_sweeps(window.pc0, other) for other in (window.pch[0], window.pc1))
-    return before >= LEAST_SHARE and next_one < MISPLACED * before
+def _fits_only(sweep: Sweep, one: Sweep, other: Sweep) -> bool:
+    """Test whether a sweep fits one of its neighbours, but not the other one."""
+    share, of_other = (share_of_sweeps(sweep, each) for each in (one, other))
+    return share >= LEAST_SHARE and of_other < MISPLACED * share
 
 
 def pair_problem(pc0: Sweep, pc1: Sweep) -> str:

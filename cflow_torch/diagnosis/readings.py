@@ -56,6 +56,9 @@ _OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading h
 _SHIFT, _PEAK = 0.15, 1.2
 _TURN = 1.1  # share of a direction over that of its opposite, from which other starts of its turn are compared
 EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
+# Traffic stays in place without the ego motion, or under a part of it: up to 2.5 times the share as given, if the poses
+# are right. If they are wrong by so many metres, less than this part of that under the right reading is in place.
+_FAR, _OF_FAR = 2.0, 1 / 3
 _OF_ERRORS = 1.2  # least share with another motion in each pair over that as given
 _EXCUSE = 1.1  # share with another motion in each pair over that of a reading with a name
 _SLIGHT, _OBLIQUE = np.radians((2, 10))  # least angles between axes that are turned and those as given, or with a name
@@ -243,12 +246,16 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
     of_pairs = [pair.shares_of_poses(scan) for pair in moving]
     found: dict[str, Reading] = {}
     if min(each[GIVEN] for each in of_pairs) < _UNCLEAR and not any(WORLD in each for each in of_pairs):
-        found, of_found = _compare_motions(moving, scan)
-        of_pairs = [{**each, **more} for each, more in zip(of_pairs, of_found)]
+        found, others = _compare_motions(moving, scan)
+        of_pairs = [{**each, **other.shares_of_poses(scan)} for each, other in zip(of_pairs, others)]
+        moving = [
+            replace(pair, transforms={**pair.transforms, **other.transforms}) for pair, other in zip(moving, others)
+        ]
     shares, clear = _compare(of_pairs)
     judgement = Judgement(shares, found=found, scan=scan, shares_of_scans=shares_of_scans)
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
         return replace(judgement, best=(WORLD,))
+    clear = [name for name in clear if all(map(partial(_is_clear_in, name), moving, of_pairs))]
     if clear or shares[GIVEN] >= _HOPELESS:
         best = _equals(clear, shares)
         elsewhere = {name: _mounting(0, *_place_of(moving, scan, 0)) for name in best if name in MOUNTS}
@@ -258,6 +265,13 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
     # Two clouds that stand still under no motion at all may have no static structure, so they do not show anything.
     is_hopeless = len(moving) > 1 or bool(_judge_motion(moving).best)
     return replace(judgement, best=(NO_READING,)) if is_hopeless else judgement
+
+
+def _is_clear_in(name: str, pair: Pair, shares: Mapping[str, float]) -> bool:
+    """Test whether hardly any structure of a pair is in place as given, if a reading moves it far."""
+    if name not in shares or difference(pair.transforms[name], pair.transforms[GIVEN]) < _FAR:
+        return True
+    return shares[GIVEN] <= _OF_FAR * shares[name]
 
 
 def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...]:
@@ -283,14 +297,14 @@ def _is_small(name: str) -> bool:
     return name == MOUNT or (name in _COMPARED and _COMPARED[name].opposite != "")
 
 
-def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Reading], list[dict[str, float]]]:
+def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Reading], list[Pair]]:
     """Compare the motions of the poses with those under which the points fit.
 
     They may be turned by an angle, also if the LiDAR is elsewhere; turns by nearly a multiple of 90 degrees alone are
     left out, because such readings have names. They may be longer or shorter. Or each pair has another small error.
 
     Returns:
-        These readings, and for each pair the shares under those of them that it shows.
+        These readings, and the pairs with those of them that each shows.
     """
     motions = [_motion_of(pair, scan) for pair in pairs]
     steps = [pair.transforms[GIVEN] for pair in pairs]
@@ -300,18 +314,17 @@ def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Readin
         f"the poses are off, by up to {max(errors):.1f} m between two sweeps",
         fix="exact poses and times, or data.odometry=refine if they are noisy",
     )
-    of_pairs = []
+    read = []
     for pair, step, motion, error in zip(pairs, steps, motions, errors):
-        read = {name: reading.of_poses(step) for name, reading in found.items() if reading.of_poses}
-        shares = {name: replace(pair, transforms={GIVEN: T}).share(scan) for name, T in read.items()}
+        transforms = {name: reading.of_poses(step) for name, reading in found.items() if reading.of_poses}
         if max(errors) > _SMALLEST_ERROR and error <= min(_LARGEST_ERROR, float(np.linalg.norm(step[:2, 3])) / 2):
-            share = replace(pair, transforms={GIVEN: motion}).share(scan)
-            shares.update({INACCURATE: share} if share > pair.share(scan) else {})  # else it fits as given
-        of_pairs.append(shares)
-    if sum(INACCURATE in shares for shares in of_pairs) < min(2, len(pairs)):  # one of several may have another cause
-        for shares in of_pairs:
-            shares.pop(INACCURATE, None)
-    return found, of_pairs
+            fitted = replace(pair, transforms={GIVEN: motion})
+            transforms.update({INACCURATE: motion} if fitted.share(scan) > pair.share(scan) else {})
+        read.append(replace(pair, transforms={GIVEN: step, **transforms}))
+    if sum(INACCURATE in pair.transforms for pair in read) < min(2, len(pairs)):  # one of several: another cause
+        for pair in read:
+            pair.transforms.pop(INACCURATE, None)
+    return found, read
 
 
 def _readings_of_motions(pairs: Sequence[Pair], scan: str, motions: Sequence[np.ndarray]) -> dict[str, Reading]:
@@ -397,33 +410,35 @@ def _motion_of(pair: Pair, scan: str) -> np.ndarray:
 def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:
     """Return the scan under which the world stands still, and the shares of those that were compared.
 
-    The instant of a sweep is when the LiDAR looks ahead. If no such scan is clearly better than as given, it may be the
-    start or the end of a turn, which shows where the motion changes.
+    Points with times may be compensated already, or their times may be wrong: then we compare directions with the
+    better of both. The instant of a sweep is when the LiDAR looks ahead. If no such scan is clearly better, and points
+    have no times, it may be the start or the end of a turn, which shows where the motion changes.
     """
-    expected, first, *_ = pairs[0].scans
-    ahead, *others = INSTANTS
-    result = _best_direction(pairs, ahead)
-    shows_instants = any(name in pair.transforms for pair in pairs for name in HALVES)
-    if result[0] != expected or first not in DIRECTIONS or not shows_instants:
-        return result
-    found = [_best_direction(pairs, instant) for instant in others]
-    scan, shares = max(found, key=lambda each: each[1][each[0]])
-    return (scan, shares) if scan != expected else result
+    expected, *others = [scan for scan in pairs[0].scans if scan not in DIRECTIONS]
+    scan, of_times = _best_of(pairs, expected, others) if others else (expected, {})
+    turned = [pair for pair in pairs if any(direction in pair.scans for direction in DIRECTIONS)]
+    if not turned:
+        return scan, of_times
+    ahead, *instants = INSTANTS
+    found, shares = _best_of(turned, scan, [direction + ahead for direction in DIRECTIONS])
+    if found == scan and not others and any(name in pair.transforms for pair in turned for name in HALVES):
+        of_instants = [_best_of(turned, scan, [name + instant for name in DIRECTIONS]) for instant in instants]
+        best, of_best = max(of_instants, key=lambda each: each[1][each[0]])
+        found, shares = (best, of_best) if best != scan else (found, shares)
+    return found, {**of_times, **shares} if found != scan else of_times or shares
 
 
-def _best_direction(pairs: Sequence[Pair], instant: str) -> tuple[str, dict[str, float]]:
-    """Return the best scan of an instant, one of `INSTANTS`, and the shares of those that were compared.
+def _best_of(pairs: Sequence[Pair], expected: str, others: Sequence[str]) -> tuple[str, dict[str, float]]:
+    """Return the best of scans, and the shares of those that were compared.
 
-    Points with times may be compensated already, so we move them only if they then fit at least as well. If a direction
-    fits better than its opposite, turns may begin behind the vehicle or elsewhere: we choose behind, unless another
-    start is clearly better. If the structure is shifted along the path, less of it must be in place: along smooth walls
-    this is not so.
+    Points with times that are expected are moved by these if they then fit at least as well. If a direction fits better
+    than its opposite, turns may begin behind the vehicle or elsewhere: we choose behind, unless another start is
+    clearly better. If the structure is shifted along the path, less of it must be in place: along smooth walls this is
+    not so.
     """
-    expected, *others = pairs[0].scans
-    others = [scan + instant for scan in others]
     of_pairs = [pair.shares_of_scans((expected, *others)) for pair in pairs]
     shares, clear = _compare(of_pairs, expected)
-    if expected == TIMES:
+    if expected == TIMES and OFF in others:
         return max(shares, key=shares.__getitem__), shares  # ties: the times
     best, *opposite = sorted(others, key=shares.__getitem__, reverse=True)
     if best in SCANS and shares[best] >= _TURN * max(shares[scan] for scan in opposite):

@@ -97,6 +97,18 @@ def test_the_direction_is_found_and_points_return_to_the_truth(raw: Drive, truth
     assert np.array_equal(again.sweep(3).points, log.sweep(3).points) and again.scan == log.scan
 
 
+def test_times_that_count_down_do_not_hide_the_azimuth(raw: Drive) -> None:
+    class CountingDown(Untimed):
+        has_raw_times = True
+
+        def sweep(self, index: int) -> Sweep:
+            sweep = self.log.sweep(index)
+            return replace(sweep, point_times=-np.asarray(sweep.point_times))
+
+    log = DeskewedLog(CountingDown(raw))
+    assert log.scan == "clockwise" and "with times" in log.findings()[-1].text
+
+
 def test_a_lidar_that_turns_the_other_way_is_found() -> None:
     log = DeskewedLog(Untimed(make(start=-180.0, span=360.0)))
     assert log.scan == "counterclockwise"

@@ -531,7 +531,7 @@ def test_missing_poses_are_named_if_the_sensor_moves(source, request):
     [
         ("nuscenes", "street", 1),
         *(pytest.param(profile, "street", 1, marks=pytest.mark.slow) for profile in ("av2", "truckscenes", "waymo")),
-        *(("demo", "highway", seed) for seed in (1, 3, 4)),
+        *(("demo", "highway", seed) for seed in (1, 3, 4, 21, 31)),
         *(("demo", "narrow", 1), ("demo", "car_park", 1), ("demo", "crossing", 1)),
     ],
 )
@@ -752,7 +752,47 @@ def test_ground_masks_of_other_rows_and_of_all_points_are_recognised(request, so
     for wrong in (shuffled, shifted):
         assert any("has it the rows of this sweep" in text for text in find_problems(wrong))
     assert any("no point would have flow" in text for text in find_problems(Wrong(log, masks=np.ones_like)))
-    assert not any("ground" in text for text in find_problems(Wrong(log, masks=np.zeros_like)))
+    (text,) = [text for text in find_problems(Wrong(log, masks=np.zeros_like)) if "ground" in text]
+    assert "empty, but the sweep contains ground" in text
+
+
+def test_poses_of_another_sensor_are_not_taken_for_other_axes_of_the_points(drive):
+    """Poses of LOAM (x left, y up, z forward), next to points with x forward."""
+    (problem,) = find_problems(Wrong(drive, poses=each(lambda pose: pose @ as_matrix(AXES["z_first"].T))))
+    assert "are of the points' frame (else give data.ego_T_lidar)" in problem and "data.read_as" not in problem
+
+
+class Changed(LogWrapper):
+    """A log with changed sweeps. `change` is called with the index and the sweep."""
+
+    def __init__(self, log, change):
+        super().__init__(log)
+        self.change = change
+
+    def sweep(self, index):
+        return self.change(index, self.log.sweep(index))
+
+
+def test_a_first_sweep_of_a_part_of_a_turn_hides_no_mistake(drive):
+    def upside_down(index, sweep):
+        points = sweep.points[: 500 if index == 0 else None]
+        return replace(sweep, points=points * np.float32([1, -1, -1]), is_ground=None)
+
+    assert any("points_upside_down" in text for text in find_problems(Changed(drive, upside_down)))
+
+
+def test_masks_that_are_wrong_in_later_sweeps_are_told(drive):
+    def inverted(index, sweep):
+        return replace(sweep, is_ground=sweep.is_ground == (index == 0))
+
+    (problem,) = find_problems(Changed(drive, inverted))
+    assert "the mask of sweep 5 is" in problem and "invert the mask" in problem
+
+
+def test_coordinates_in_the_world_that_are_too_large_for_float32_are_told(drive):
+    far = as_matrix(np.eye(3), (690_000, 5_330_000, 520))
+    wrong = Wrong(drive, points=lambda points, pose: to_world(points, far @ pose), poses=each(lambda pose: far @ pose))
+    assert any("float32 with steps of 0.5 m" in text for text in find_problems(read_as(wrong)))
 
 
 def test_opening_a_log_warns_of_likely_mistakes(drive):

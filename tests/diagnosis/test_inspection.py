@@ -1,0 +1,53 @@
+"""What `Inspection` says of windows that are wrong on purpose: ground masks and history."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cflow_torch.data.log import window
+from cflow_torch.diagnosis.inspection import Inspection
+from cflow_torch.simulator import make_drive
+
+
+@pytest.fixture(scope="module")
+def right():
+    return window(make_drive(seed=2, num_sweeps=6), 4, num_history=3)
+
+
+def said_of(wrong):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Inspection()([wrong])
+    return [str(each.message) for each in caught]
+
+
+def test_right_windows_stay_silent(right):
+    assert said_of(right) == []
+    assert said_of(replace(right, pc0=replace(right.pc0, is_ground=np.zeros_like(right.pc0.is_ground)))) == []
+
+
+@pytest.mark.parametrize(
+    ("mask", "text"),
+    [
+        (np.logical_not, "invert the mask"),
+        (np.ones_like, "no point would have flow"),
+        (lambda mask: mask[::-1], "has it the rows of this sweep"),
+        (lambda mask: None, "without a ground mask contains ground"),
+    ],
+)
+def test_wrong_ground_masks_are_told(right, mask, text):
+    wrong = replace(right, pc0=replace(right.pc0, is_ground=mask(right.pc0.is_ground)))
+    (said,) = said_of(wrong)
+    assert text in said
+
+
+def test_a_history_with_other_poses_or_in_the_reverse_order_is_told(right):
+    late = [replace(sweep, pose=before.pose) for sweep, before in zip(right.pch, right.pch[1:])]
+    back = [replace(sweep, pose=other.pose) for sweep, other in zip(reversed(right.pch), right.pch)]
+    for history in (late, back):
+        (said,) = said_of(replace(right, pch=tuple(history)))
+        assert "the first sweep of the history does not fit pc0" in said
