@@ -179,6 +179,21 @@ def test_the_name_open_does_not_hide_that_of_python() -> None:
     assert "open" not in names and "estimate_flow" in names and "open" in dir(cflow_torch)
 
 
+def test_results_in_the_folder_of_the_data_are_no_input(tmp_path: Path) -> None:
+    """Else flow was computed of flow, and the first log got another name, so a run was not resumed."""
+    for place in ("drive/points", "flow/drive", "clean/drive/points"):
+        (tmp_path / place).mkdir(parents=True)
+        for number in range(2):
+            np.save(tmp_path / place / f"{number}.npy", np.ones((5, 3)))
+    record = json.dumps({"run": {"versions": {"cflow_torch": "1"}}})
+    (tmp_path / "flow" / "drive" / "manifest.json").write_text(record)
+    (tmp_path / "clean" / "drive" / "clean.json").write_text(record)
+    assert find_sources("arrays", tmp_path) == [tmp_path / "drive"]
+    assert find_sources("arrays", tmp_path / "clean") == [tmp_path / "clean" / "drive"], "a clean log alone is one"
+    (tmp_path / "flow" / "drive" / "manifest.json").write_text("{}")
+    assert len(find_sources("arrays", tmp_path)) == 2, "a file of that name of others means nothing"
+
+
 def test_logs_of_one_name_are_told_apart(tmp_path: Path) -> None:
     """Else the results of the second one would be taken for those of the first."""
     for place in ("monday/run", "tuesday/run", "tuesday/walk"):
