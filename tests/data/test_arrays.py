@@ -286,6 +286,24 @@ def test_clouds_of_two_sensors_in_one_folder_need_a_choice(tmp_path):
         ArraysLog(tmp_path)
 
 
+@pytest.mark.parametrize("names", [("os0_{:03d}", "os1_{:03d}"), ("lidar0_17{:08d}00", "lidar1_17{:08d}30")])
+def test_sensors_may_differ_by_a_digit(tmp_path, names):
+    for name in names:
+        for number in range(3):
+            np.save(tmp_path / f"{name.format(number)}.npy", np.ones((4, 3)))
+    with pytest.raises(CFlowError, match=r"several kinds of clouds, \w+0_\*.npy, \w+1_\*.npy: choose one"):
+        ArraysLog(tmp_path)
+    assert len(ArraysLog(tmp_path, suffix=names[1].split("_")[0] + "_*.npy")) == 3
+
+
+def test_numbers_that_count_tell_no_sensors(tmp_path):
+    for name in ("drive1_a", "20240105T12_00", "20240105T13_00", "scan1", "scan10_x2"):
+        (tmp_path / name).mkdir()
+        for number in range(3):
+            np.save(tmp_path / name / f"{name}{number}.npy", np.ones((4, 3)))
+        assert len(ArraysLog(tmp_path / name)) == 3
+
+
 def test_files_with_other_contents_are_refused(tmp_path):
     np.save(tmp_path / "flat.npy", np.zeros(9))
     np.save(tmp_path / "pickle.npy", np.array([{}, 1], dtype=object), allow_pickle=True)

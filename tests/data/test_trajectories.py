@@ -848,6 +848,60 @@ def test_clouds_of_a_second_sensor_are_said(tmp_path) -> None:
         ArraysLog(tmp_path)
 
 
+def test_labels_and_maps_next_to_clouds_are_not_the_clouds(tmp_path) -> None:
+    for name in ("a_labels", "sweeps", "boxes"):
+        clouds(tmp_path / name)
+    for file in (tmp_path / "a_labels").iterdir():
+        np.save(file, np.zeros(5, np.int32))
+    for file in (tmp_path / "sweeps").iterdir():
+        np.save(file, np.ones((500, 3)))
+    for name in ("global", "surface"):
+        np.save(tmp_path / f"{name}.npy", np.ones((2000, 3)))
+    (tmp_path / "poses.txt").write_text("\n".join(EXACT))
+    assert find_array_logs(tmp_path) == [tmp_path]
+    with pytest.warns(CFlowWarning, match="we read the clouds in sweeps; there are others in boxes$"):
+        log: Any = ArraysLog(tmp_path)
+    assert len(log) == len(log.poses) == 12 and {file.parent.name for file in log.files} == {"sweeps"}
+
+
+POSES_NEAR = {
+    "lidar/pcd": "poses.txt",
+    "lidar/top": "poses.txt",
+    "clouds_of_os1": "poses/poses.txt",
+    "one": "poses_one.txt",
+    "two": "ground_truth/two.txt",
+}
+
+
+@pytest.mark.parametrize("below", POSES_NEAR)
+def test_poses_of_as_many_sweeps_are_found_near_a_folder(tmp_path, below) -> None:
+    """Without times, the name of the file or of its folder must say that these are poses."""
+    folder = clouds(tmp_path / "drive" / below, range(12))
+    file = tmp_path / "drive" / POSES_NEAR[below]
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("\n".join(rows(POSES[:, :3].reshape(12, 12))))
+    file.with_name("poses_other.txt").write_text("\n".join(rows(POSES[:9, :3].reshape(9, 12))))  # of another length
+    (tmp_path / "drive" / "numbers.txt").write_text(file.read_text())
+    assert np.allclose(ArraysLog(folder).poses, POSES)
+
+
+def test_a_calibration_of_a_few_matrices_is_no_trajectory(tmp_path) -> None:
+    clouds(tmp_path, range(12))
+    (tmp_path / "calib").mkdir()
+    for name in ("camera", "radar", "imu"):
+        np.savetxt(tmp_path / "calib" / f"{name}.txt", np.eye(4))
+    assert ArraysLog(tmp_path).poses is None
+
+
+def test_of_two_trajectories_that_of_the_times_of_the_sweeps_is_used(tmp_path) -> None:
+    clouds(tmp_path)
+    (tmp_path / "Ouster_gt.txt").write_text("\n".join(EXACT))
+    other = [line(k, seconds(stamp + 30_000_000)) for k, stamp in enumerate(STAMPS)]
+    (tmp_path / "Velodyne_gt.txt").write_text("\n".join([line(0, seconds(STAMPS[0] - 10**8)), *other]))
+    with pytest.warns(CFlowWarning, match="its poses are those of Ouster_gt.txt"):
+        assert ArraysLog(tmp_path).poses[:, 0, 3].tolist() == list(range(12))
+
+
 def test_a_gap_in_the_times_splits_a_folder(tmp_path) -> None:
     late = [stamp + 2 * 10**9 * (k > 5) for k, stamp in enumerate(STAMPS)]
     with pytest.warns(CFlowWarning, match="it has 1 gaps between sweeps .the first is 2.1 s long, after sweep 5"):

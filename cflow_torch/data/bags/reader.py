@@ -154,8 +154,13 @@ class BagLog(Log):
         """Return the poses of the file that is named, of the bag or, with "auto", of a file near the bag."""
         trajectory = self._poses_of_file(poses) or self._poses_of_bag(topics, poses, tracks)
         if trajectory is None and poses == "auto":
-            trajectory = find_poses_near(self.path.parent, self.timestamps, self._note)
+            trajectory = find_poses_near(
+                self.path.parent, self.log_id, self.timestamps, self._is_covered_by, self._note
+            )
         return trajectory
+
+    def _is_covered_by(self, trajectory: Trajectory) -> bool:
+        return trajectory.covers(self.timestamps)
 
     def _poses_of_bag(self, topics: dict[str, str], poses: str | None, tracks: dict[str, Any]) -> Trajectory | None:
         """Return the poses of transforms or of a topic; None = there are none. Clouds of another clock are shifted."""
