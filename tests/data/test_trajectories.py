@@ -168,6 +168,14 @@ def test_names_are_milliseconds() -> None:
     assert times_of_names(["1700000000123", "1700000000223"]) == [1_700_000_000_123_000_000, 1_700_000_000_223_000_000]
 
 
+@pytest.mark.parametrize("fraction", ["{}", ".{}", "{}000", "_{}"])
+def test_names_are_dates_without_separators(fraction: str) -> None:
+    """A number of 17 digits was taken for microseconds, which an int64 of nanoseconds cannot hold."""
+    names = [f"20231114221{320 + k // 10}" + fraction.format(f"{k % 10}00") for k in range(24)]
+    assert times_of_names(names) == [1_700_000_000_000_000_000 + k * 100_000_000 for k in range(24)]
+    assert times_of_names(["99999999999999997", "99999999999999998"]) is None
+
+
 @pytest.mark.parametrize("first", ["000001", "frame1", "000_001", "2024_01_05", "0000000000001", "0000000000000000001"])
 def test_other_names_are_no_times(first: str) -> None:
     assert times_of_names([first, first[:-1] + "2"]) is None and times_of_names(["1.5", "a"]) is None
