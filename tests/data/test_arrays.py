@@ -246,6 +246,25 @@ def test_columns_are_found_by_name_or_position(tmp_path):
         assert np.array_equal(read_cloud(file, 5), points), file.name
 
 
+def test_a_column_that_counts_the_rows_is_no_coordinate(tmp_path):
+    """As pandas writes it; the check called such points centimetres. Names may begin alike: lidar_x, lidar_y, ..."""
+    points = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
+    counted = np.column_stack([np.arange(30), points])
+    np.savetxt(tmp_path / "plain.csv", counted, "%.9g", delimiter=",")
+    (tmp_path / "pandas.csv").write_text(",0,1,2\n" + (tmp_path / "plain.csv").read_text())
+    np.savetxt(tmp_path / "from_1.xyz", counted + (1, 0, 0, 0), "%.9g")
+    np.save(tmp_path / "plain.npy", counted)
+    columns = {"index": counted[:, 0], **{f"lidar_{axis}": points[:, k] for k, axis in enumerate("xyz")}}
+    feather.write_feather(pa.table(columns), str(tmp_path / "named.feather"))
+    feather.write_feather(pa.table(dict(zip("abcd", columns.values()))), str(tmp_path / "other.feather"))
+    normals = {f"normal_{axis}": points[:, 0] for axis in "xyz"}
+    feather.write_feather(pa.table({**normals, **columns}), str(tmp_path / "normals.feather"))
+    for file in sorted(tmp_path.iterdir()):
+        assert np.array_equal(read_cloud(file).astype(np.float32), points), file.name
+    np.save(tmp_path / "xyz.npy", counted[:, :3])
+    assert np.array_equal(read_cloud(tmp_path / "xyz.npy"), counted[:, :3]), "three columns are x, y, z"
+
+
 @pytest.mark.parametrize("kind", ["i2", "i4", "i8"])
 def test_integers_are_millimetres_or_centimetres_and_keep_their_digits(tmp_path, kind):
     points = np.array([[12345, -20000, 300], [1, 2, 3], [32767, 0, -32768]], kind)
