@@ -24,6 +24,7 @@ from cflow_torch.data.arrays.writer import write_array_log
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.log import Log
 from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
+from cflow_torch.types import CFlowWarning
 
 STAMP = 1_700_000_000_123_456_789
 
@@ -463,6 +464,11 @@ def test_kitti_camera_poses_become_lidar_poses(tmp_path, folder):
     (folder / "calib.txt").write_text(f"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: {row}\n")
     assert np.abs(ArraysLog(folder).poses - lidar).max() < 1e-12
     assert np.abs(ArraysLog(folder, calibration=None).poses[1] - lidar[1]).max() > 0.5
+    kitti = (folder / "calib.txt").read_text()
+    (folder / "calib.txt").write_text("fx 700\nP0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    with pytest.warns(CFlowWarning, match="calib.txt has no Tr, so we take the poses for those of the LiDAR"):
+        assert np.array_equal(ArraysLog(folder).poses, ArraysLog(folder, calibration=None).poses)
+    (folder / "calib.txt").write_text(kitti)
     tree = tmp_path / "kitti" / "sequences" / "00"  # dataset/sequences/00/velodyne and dataset/poses/00.txt
     tree.mkdir(parents=True)
     (folder / "points").rename(tree / "velodyne")

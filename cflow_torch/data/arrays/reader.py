@@ -191,7 +191,12 @@ class ArraysLog(Log):
         chosen = resolve(self.folder, calibration, ("calib.txt",), "calibration")
         if chosen is None or (calibration == "auto" and not trajectory.is_kitti):
             return trajectory, False
-        T_cam_lidar = transform(read_calibration(chosen), chosen, *CAMERA_KEYS)
+        values = read_calibration(chosen)
+        if calibration == "auto" and values.keys().isdisjoint(CAMERA_KEYS):
+            fix = "if they are KITTI's poses of a camera, download data_odometry_calib.zip, which has it"
+            self._note(f"{chosen.name} has no Tr, so we take the poses for those of the LiDAR: {fix}")
+            return trajectory, False
+        T_cam_lidar = transform(values, chosen, *CAMERA_KEYS)
         converted = np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar
         if calibration == "auto" and _drives_along_x(trajectory.poses) and not _drives_along_x(converted):
             self._note(
