@@ -293,6 +293,25 @@ def test_three_numbers_are_a_plane_pose_if_the_vehicle_drives_where_it_heads(tmp
             poses_text.read_poses(path)
 
 
+def test_a_yaw_that_is_not_wrapped_has_radians(tmp_path) -> None:
+    yaw = np.arange(60) * 0.2  # almost two turns
+    way = np.cumsum(np.exp(1j * yaw))
+    for unit in (1.0, 180 / np.pi):
+        lines = rows(np.column_stack([way.real, way.imag, 0 * yaw, 0 * yaw, 0 * yaw, yaw * unit])[:-1])
+        (tmp_path / "poses.txt").write_text("\n".join(lines))
+        turned = poses_text.read_poses(tmp_path / "poses.txt").poses[1:, 0, 0]
+        assert np.allclose(turned, np.cos(yaw[1:-1]), atol=1e-6), unit
+
+
+def test_a_number_may_be_in_front_of_tum(tmp_path) -> None:
+    (tmp_path / "poses.txt").write_text("\n".join(f"{k} {each}" for k, each in enumerate(EXACT)))
+    read = poses_text.read_poses(tmp_path / "poses.txt")
+    assert read.times_ns.tolist() == STAMPS and np.allclose(read.poses[:, 0, 3], range(12), atol=1e-5)
+    (tmp_path / "poses.txt").write_text("\n".join(f"{k % 3} {each}" for k, each in enumerate(EXACT)))
+    with pytest.raises(CFlowError, match="9 numbers per line"):
+        poses_text.read_poses(tmp_path / "poses.txt")
+
+
 def test_places_on_the_globe_become_metres(tmp_path) -> None:
     """The first place is the origin, x is east, and 1e-5 degrees of latitude are 1.113 m."""
     header = "time,latitude_deg,longitude_deg,alt,roll,pitch,yaw"
