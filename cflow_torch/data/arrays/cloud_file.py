@@ -283,7 +283,8 @@ def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:
         return {name: array[name] for name in array.dtype.names}
     if array.ndim != 2 or array.shape[1] < 3 or array.shape[1] > max(_MOST_COLUMNS, len(array)):
         raise CFlowError(f"it has an array of shape {array.shape}; it must be (N, 3+), columns x, y, z first")
-    columns = array.T[first_coordinate(array.T) :]
+    columns = list(array.T)
+    columns = columns[first_coordinate(columns) :]
     return dict(zip(default_names(len(columns)), columns))
 
 

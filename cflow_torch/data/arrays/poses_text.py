@@ -177,14 +177,15 @@ def _end_in_quaternions(words: np.ndarray) -> bool:
 
 def _end_in_headings(words: np.ndarray) -> bool:
     """Tell whether lines of three numbers are x, y, yaw: the vehicle drives where it heads. They may be x, y, z."""
-    x, y, yaw = words.astype(np.float64).T
+    numbers = words.astype(np.float64)
+    yaw: np.ndarray = numbers[:, 2]
     is_large = np.nanmax(np.abs(yaw), initial=0) > 2 * np.pi
-    return _ahead(x, y, np.radians(yaw) if is_large else yaw) > _AHEAD
+    return _ahead(numbers, np.radians(yaw) if is_large else yaw) > _AHEAD
 
 
-def _ahead(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> float:
+def _ahead(positions: np.ndarray, yaw: np.ndarray) -> float:
     """Return the median cosine of the angle from the heading, yaw in radians, to the motion; 0 = it stands."""
-    step: np.ndarray = np.diff(x + 1j * y)
+    step: np.ndarray = np.diff(positions[:, 0] + 1j * positions[:, 1])
     moved = np.flatnonzero(np.abs(step) > _LEAST_STEP)
     ahead = np.real(step[moved] * np.exp(-1j * yaw[moved])) / np.abs(step[moved])
     return float(np.median(ahead)) if len(moved) else 0.0
@@ -229,8 +230,8 @@ def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.
         return poses_from_quaternions(positions, quaternions, lambda row: f"{path}: pose {row}")
     angles = np.stack([values.get(name, zeros) for name in _ANGLES])
     are_degrees = np.abs(angles).max() > 2 * np.pi
-    if are_degrees and _ahead(*positions.T[:2], angles[2]) > _AHEAD:  # a yaw that is not wrapped
-        are_degrees = _ahead(*positions.T[:2], np.radians(angles[2])) > _AHEAD
+    if are_degrees and _ahead(positions, angles[2]) > _AHEAD:  # a yaw that is not wrapped
+        are_degrees = _ahead(positions, np.radians(angles[2])) > _AHEAD
     if are_degrees or (names and "deg" in names[roles["yaw"]].lower()):
         angles = np.radians(angles)
     return as_matrix(rotations_of(angles), positions)
