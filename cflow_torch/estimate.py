@@ -63,7 +63,7 @@ def estimate_flow(
     Convention:
         NaN and infinite points, missing returns (see `missing_returns` of cflow_torch.windows.returns), ground and
         points outside `point_cloud_range` get residual flow 0, cluster -1 and `is_valid` False. Empty sweeps give an
-        empty or all-zero result.
+        empty or all-zero result. We do not search points on a GPU, nor more than ten million, for missing returns.
 
     Warns:
         CFlowWarning: we left out missing returns; a sweep has no mask, so we found its ground (`ground="auto"`); a

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Iterator, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ _MIN_OVERLAP = 0.1  # least intersection over union of the voxels of two groups 
 _MIN_CLAIM = 0.5  # a track of N points claims a group if its box holds at least 0.5 N points of the group
 MIN_STOPPED_SHARE = 0.3  # a track of N points has stopped if its box holds at least 0.3 N static points
 MARGIN = 0.2  # metres, added to length, width and height of boxes around the visible points of an object
+_ROUNDING = 1e-3  # metres, added to the reach of a box
 _ORIGIN_INSIDE = 0.5  # metres, at least, from the origin of a vehicle to its sides
 _REACH = 2.7  # metres from the origin of the vehicle to the farthest of its returns
 _LEAST_RIDE, _RIDE_ERROR = 0.2, 0.1  # metres per sweep, faster than people walk; share by which flow is off
@@ -105,7 +106,7 @@ def _value_of_box(values: Tensor, box: Tensor, outside: float) -> Tensor:
 
 def match(tracks: TrackStates, points: Tensor, track_of_point: Tensor, groups: MovingGroups) -> TrackMatches:
     """Match tracks with a sweep, given the predicted points (P, 3) of the tracks and the track of each point."""
-    track, group = link(points, track_of_point, *groups.moving, _MIN_OVERLAP)
+    track, group = link(points, track_of_point, *groups.moving)
     may_have_stopped = tracks.is_confirmed.clone()
     may_have_stopped[track] = False
     candidate = may_have_stopped.nonzero()[:, 0]
@@ -122,13 +123,13 @@ def match(tracks: TrackStates, points: Tensor, track_of_point: Tensor, groups: M
     )
 
 
-def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float) -> tuple[Tensor, Tensor]:
+def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor) -> tuple[Tensor, Tensor]:
     """Match groups of two sweeps that share small voxels, one to one, then the remaining groups in larger voxels.
 
     Points are (N, 3) float64, metres. The points of the earlier sweep are already at their predicted positions in the
-    current one. The group of each point is (N,) int64, counted from 0. `min_share` is the smallest overlap of a match:
-    the intersection over union of the voxels of both groups. Returns the matched groups of the earlier and of the
-    current sweep, (K,) int64 each.
+    current one. The group of each point is (N,) int64, counted from 0. The voxels of two groups that match overlap
+    by `_MIN_OVERLAP` or more, as intersection over union. Returns the matched groups of the earlier and of the current
+    sweep, (K,) int64 each.
 
     Convention: greedy, the largest overlap first. Ties: the smaller earlier group, then the smaller current one.
     Cost: for each size of voxel, four sorts of the points.
@@ -136,7 +137,7 @@ def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_s
     matches: dict[int, int] = {}
     taken: set[int] = set()
     for side in VOXELS:
-        for earlier, current in _by_overlap(points0, group0, points1, group1, min_share, side):
+        for earlier, current in _by_overlap(points0, group0, points1, group1, side):
             if earlier not in matches and current not in taken:
                 matches[earlier] = current
                 taken.add(current)
@@ -144,9 +145,7 @@ def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_s
     return matched[:, 0], matched[:, 1]
 
 
-def _by_overlap(
-    points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float, side: float
-) -> list[list[int]]:
+def _by_overlap(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, side: float) -> list[list[int]]:
     """Pairs of groups (earlier, current) that share voxels of `side` metres, the largest overlap first."""
     if not (len(points0) and len(points1)):
         return []
@@ -162,7 +161,7 @@ def _by_overlap(
     earlier, current, _, shared = unique_pairs(group0.repeat_interleave(count), group1[concat_ranges(begin, count)])
     share = shared / (torch.bincount(group0)[earlier] + torch.bincount(group1)[current] - shared)
     order = share.argsort(descending=True, stable=True)
-    order = order[share[order] >= min_share]
+    order = order[share[order] >= _MIN_OVERLAP]
     return torch.stack([earlier[order], current[order]], 1).tolist()  # type: ignore[no-any-return]
 
 
@@ -173,14 +172,28 @@ def _distinct(voxel: Tensor, group: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) -> Tensor:
-    """(N,) int64 index of the first of K upright boxes that holds each of (N, 3) float64 points, -1 = none.
+    """(N,) int64 index of the first of K upright boxes that holds each of (N, 3) finite float64 points, -1 = none.
 
-    The (K, 3) sizes are length, width, height; the length is along `heading`, (K,) radians. Cost: K * N comparisons.
+    The (K, 3) sizes are length, width, height; the length is along `heading`, (K,) radians. Cost: one sort of the
+    points, then for each box the points of its strip of x.
     """
-    offset = turned(points[None] - centre[:, None], -heading[:, None])
-    is_inside = (offset.abs() <= size[:, None] / 2).all(2)
-    is_outside = ~is_inside.any(0, keepdim=True)
-    return torch.cat([is_outside, is_inside]).to(torch.uint8).argmax(0) - 1
+    by_x = points[:, 0].argsort()
+    box = torch.full_like(by_x, -1)
+    rows = list(points_in_boxes(points[by_x], centre, size, heading))
+    for number in reversed(range(len(rows))):  # so that the first box wins
+        box[by_x[rows[number]]] = number
+    return box
+
+
+def points_in_boxes(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) -> Iterator[Tensor]:
+    """Yield the rows of the (N, 3) finite points, sorted by x, that are in each of K boxes, see `box_of_point`."""
+    reach = size[:, :2].norm(dim=1) / 2 + _ROUNDING
+    x = points[:, 0].contiguous()
+    first = torch.searchsorted(x, centre[:, 0] - reach).tolist()
+    last = torch.searchsorted(x, centre[:, 0] + reach).tolist()
+    for number, (begin, end) in enumerate(zip(first, last)):
+        offset = turned(points[begin:end] - centre[number], -heading[number])
+        yield begin + (offset.abs() <= size[number] / 2).all(1).nonzero()[:, 0]
 
 
 def enclosing_boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:

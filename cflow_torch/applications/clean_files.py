@@ -10,12 +10,12 @@ import numpy as np
 from cflow_torch.applications.cleaning import CleanLog
 from cflow_torch.data.arrays import ArraysLog
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, copy_rows
-from cflow_torch.data.arrays.writer import POINTS_FOLDER, SweepSides, write_sides, write_sweep
+from cflow_torch.data.arrays.writer import POINTS_FOLDER, SweepSides, cloud_name, write_sides, write_sweep
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
-from cflow_torch.data.paths import stem_of, suffix_of
+from cflow_torch.data.paths import suffix_of
 from cflow_torch.diagnosis.conventions import OF_POINTS, WORLD
 from cflow_torch.types import CFlowError
 
@@ -38,7 +38,12 @@ class Removed(NamedTuple):
 
 
 def write_clean_log(
-    clean: CleanLog, log: Log, root: Path, suffix: str | None = None, record: Mapping[str, Any] | None = None
+    clean: CleanLog,
+    log: Log,
+    root: Path,
+    suffix: str | None = None,
+    record: Mapping[str, Any] | None = None,
+    replace: bool = False,
 ) -> Removed:
     """Write a clean log to `root/<log_id>`, as `write_array_log` does, and `removed/NAME.npy` for each sweep.
 
@@ -48,6 +53,7 @@ def write_clean_log(
         root: parent folder, created if it does not exist.
         suffix: suffix of the clouds; None = `own_suffix`.
         record: content of `clean.json` in the folder, such as settings; None = it is not written.
+        replace: replace an older folder when this one is complete; else an older one is a `CFlowError`.
 
     Convention: a mask has (N,) bool for the points of the sweep of `log`, True = not in the clean cloud. If the log is
         a folder of clouds with the same suffix, clouds keep their names, columns, types and VIEWPOINT, and the points
@@ -61,10 +67,10 @@ def write_clean_log(
     viewpoint = _viewpoint(log, suffix)
     total = Removed(0, 0, 0)
     sides = {}
-    with new_folder(root, log.log_id) as folder:
+    with new_folder(root, log.log_id, replace) as folder:
         (folder / REMOVED_FOLDER).mkdir()
         for index in range(len(log.timestamps)):
-            name = stem_of(own.files[index]) if isinstance(own, ArraysLog) else f"{index:06d}"
+            name = cloud_name(log, index)
             file = folder / POINTS_FOLDER / f"{name}{suffix}"
             removed = clean.removed(index)
             moving = int(clean.moving(index).sum())
@@ -100,11 +106,9 @@ def own_suffix(log: Log) -> str:
 
 def stored_masks(folder: Path, log: Log) -> Callable[[int], np.ndarray]:
     """Return a function that reads the mask of a sweep which `write_clean_log` wrote to `folder`."""
-    own = log.unwrapped
 
     def read(index: int) -> np.ndarray:
-        name = stem_of(own.files[index]) if isinstance(own, ArraysLog) else f"{index:06d}"
-        file = folder / REMOVED_FOLDER / f"{name}.npy"
+        file = folder / REMOVED_FOLDER / f"{cloud_name(log, index)}.npy"
         rows = len(log.sweep(index).points)
         mask = read_npy(file, _WRITE_AGAIN)
         if mask.shape != (rows,) or mask.dtype != bool:

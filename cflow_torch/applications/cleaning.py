@@ -11,14 +11,13 @@ import torch
 
 from cflow_torch.applications.association import MARGIN, box_of_point, enclosing_boxes
 from cflow_torch.applications.completion import TrackedPoints
-from cflow_torch.applications.moving_groups import pose_of
+from cflow_torch.applications.moving_groups import pose_of, world_points
 from cflow_torch.applications.track_table import Table
 from cflow_torch.applications.tracking import LogTracker
 from cflow_torch.config import make_config
 from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper, window
 from cflow_torch.estimate import make_model
 from cflow_torch.model import SceneFlowModel
-from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy, check_array
 
 _SLOW = 3.0  # m/s; an object that is faster in its first sweep did not wait there before
@@ -92,8 +91,8 @@ class CleanLog(MaskedLog):
     Args:
         log: any log. Sweeps are read one after the other, and only a few are held in memory.
         model: the method; None = preset `offline`.
-        flow: index -> flow of that pair, in place of a model. We use residual_flow, cluster_id and, if it
-            has it, moving, and with `remove_stopped` also is_valid.
+        flow: index -> flow of that pair, in place of a model. We use residual_flow, cluster_id and, if it has it,
+            moving; with `remove_stopped` also is_valid and, if it has it, confidence.
         remove_stopped: also remove objects before they start and after they stop, such as cars at a light. Tracking
             finds them, also in a sweep without flow. It takes a pass over the log before the first sweep is returned,
             and the memory of 1 bit per point and of the points of tracks.
@@ -168,7 +167,7 @@ class CleanLog(MaskedLog):
         """(N,) bool, points of the last sweep in the boxes to which the clusters of the sweep before have moved."""
         result = self._flow(index - 1)
         moves = self._moves(index - 1)
-        before = _world(self.log.sweep(index - 1))[moves]
+        before = world_points(self.log.sweep(index - 1), moves)
         step = as_numpy(result.residual_flow, np.float64)[moves] @ pose_of(sweep)[:3, :3].T
         clusters, group = np.unique(as_numpy(result.cluster_id)[moves], return_inverse=True)
         total = np.zeros((len(clusters), 3))
@@ -264,7 +263,7 @@ def static_map_with_intensity(log: Log, voxel_size: float = 0.1) -> tuple[np.nda
         sweep = log.sweep(index)
         if sweep.pose is None:
             raise CFlowError(f"log {log.log_id} has no poses, and a map needs them: data.odometry=true estimates them")
-        points = _world(sweep)
+        points = world_points(sweep)
         is_known = np.isfinite(points).all(1)
         points = points[is_known]
         origin = np.floor(pose_of(sweep)[:3, 3] / voxel_size) if origin is None else origin
@@ -299,10 +298,10 @@ def _intensity(columns: Mapping[str, np.ndarray]) -> np.ndarray | None:
 
 def _inside(sweep: Sweep, centre: torch.Tensor, size: torch.Tensor, heading: torch.Tensor) -> np.ndarray:
     """(N,) bool, points of a sweep that are not ground and lie in one of the boxes (world frame)."""
-    is_inside = box_of_point(torch.from_numpy(_world(sweep)), centre, size + MARGIN, heading).numpy() >= 0
-    return is_inside if sweep.is_ground is None else is_inside & ~as_numpy(sweep.is_ground).astype(bool)
-
-
-def _world(sweep: Sweep) -> np.ndarray:
-    """(N, 3) float64 points of a sweep, metres, in the world."""
-    return transform_points(as_numpy(sweep.points)[:, :3], pose_of(sweep))
+    points = world_points(sweep)
+    is_inside = np.isfinite(points).all(1)
+    if sweep.is_ground is not None:
+        is_inside &= ~as_numpy(sweep.is_ground).astype(bool)
+    box = box_of_point(torch.from_numpy(points[is_inside]), centre, size + MARGIN, heading)
+    is_inside[is_inside] = box.numpy() >= 0
+    return is_inside

@@ -8,11 +8,10 @@ import numpy as np
 import torch
 
 from cflow_torch.applications.floor import Floor
-from cflow_torch.applications.moving_groups import pose_of
+from cflow_torch.applications.moving_groups import pose_of, world_points
 from cflow_torch.applications.track_state import Times
 from cflow_torch.applications.track_table import Table
 from cflow_torch.applications.whole_boxes import KINDS, Sightings, whole_boxes
-from cflow_torch.transforms import transform_points
 from cflow_torch.types import CENTRE, SIZE, VELOCITY, FlowResult, Window, as_numpy, vectors
 
 
@@ -34,11 +33,10 @@ class TrackedPoints(NamedTuple):
         cls, index: int, sweeps: Window, result: FlowResult, track_id: np.ndarray, times: Times, floor: Floor
     ) -> TrackedPoints:
         """Keep the points of sweep `index` that have an id, of (N,) ids where -1 = no track."""
-        T_world_ego0 = pose_of(sweeps.pc0)
         T_world_ego1 = pose_of(sweeps.pc1)
-        sensor = T_world_ego0[:3, 3]
+        sensor = pose_of(sweeps.pc0)[:3, 3]
         row = np.flatnonzero(track_id >= 0)
-        position = transform_points(as_numpy(sweeps.pc0.points)[row, :3], T_world_ego0)
+        position = world_points(sweeps.pc0, row)
         step = as_numpy(result.residual_flow)[row].astype(np.float64) @ T_world_ego1[:3, :3].T
         offset = (position - sensor).astype(np.float32)
         velocity = (step / times.interval).astype(np.float32)

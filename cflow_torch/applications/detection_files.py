@@ -29,7 +29,7 @@ _MOST_BOXES = 500  # of a sample; the evaluators reject files with more
 _MODALITIES = {"use_camera": False, "use_lidar": True, "use_radar": False, "use_map": False, "use_external": False}
 
 
-def write_nuscenes(folder: PathLike, table: Table, log: Log) -> None:
+def write_nuscenes(folder: PathLike, table: Table, log: Log, data_set: str = "") -> None:
     """Write `folder/nuscenes_detection.json` and `folder/nuscenes_tracking.json`, results of nuScenes' two tasks.
 
     Args:
@@ -37,6 +37,7 @@ def write_nuscenes(folder: PathLike, table: Table, log: Log) -> None:
         table: tracks, see `track`.
         log: the drive. The samples are the key frames of a scene of nuScenes, and all sweeps of any other log, which
             are then called `<log id>_<time stamp>`. A sample without tracks has an empty list.
+        data_set: ignored.
 
     Convention: boxes are in the world of the log's poses. Sizes are width, length, height. The score is the mean
         confidence of the flow over the track, 1 where the method has none. Of more than 500 boxes of a sample, we keep
@@ -75,13 +76,13 @@ def _nuscenes_box(table: Table, row: int, token: str) -> dict[str, Any]:
     }
 
 
-def write_openpcdet(path: PathLike, table: Table, log: Log) -> None:
-    """Write a pickle of a list with a dictionary per sweep of the log, as OpenPCDet writes its detections.
+def write_openpcdet(folder: PathLike, table: Table, log: Log, data_set: str = "") -> None:
+    """Write `folder/result.pkl`, a list with a dictionary per sweep of the log, as OpenPCDet writes its detections.
 
     Each has `frame_id`, the number of the sweep (`Log.frame_number`) as "000000"; `name` (K,), `score` (K,) and
     `boxes_lidar` (K, 7) float32 of the K tracks: centre, length, width and height in metres, and heading in radians, in
     the frame of the sweep's points; `pred_labels` (K,), 1 to 4 as in `KITTI_NAMES`; and `track_id` (K,). OpenPCDet's
-    fields of the camera image are left out.
+    fields of the camera image are left out. The data set is ignored.
     """
     names = list(KITTI_NAMES)
     centre, heading = boxes_in_sweeps(table, log)
@@ -105,5 +106,5 @@ def write_openpcdet(path: PathLike, table: Table, log: Log) -> None:
     # NumPy 2 names modules that NumPy 1, which OpenPCDet uses, does not have; both read the older names. In protocol 2,
     # names are plain text.
     content = pickle.dumps(frames, protocol=2).replace(b"cnumpy._core.", b"cnumpy.core.")
-    with atomic_file(path) as file:
+    with atomic_file(as_path(folder) / OPENPCDET_FILE) as file:
         file.write(content)

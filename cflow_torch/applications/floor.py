@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from cflow_torch.applications.moving_groups import pose_of
-from cflow_torch.transforms import transform_points
+from cflow_torch.applications.moving_groups import world_points
 from cflow_torch.types import Sweep, as_numpy
 
 _CELL = 2.0  # metres; we take the ground points of a cell and of those around it
@@ -29,10 +28,10 @@ class Floor(NamedTuple):
         is_ground = np.zeros(len(points), bool) if sweep.is_ground is None else as_numpy(sweep.is_ground)
         # NaN and infinity are not near.
         is_near = (np.abs(points[:, :2]) <= _FARTHEST).all(axis=1) & np.isfinite(points[:, 2])
-        ground = points[is_ground & is_near]
-        if not len(ground):
+        is_used = is_ground & is_near
+        if not is_used.any():
             return UNKNOWN_FLOOR
-        x, y, z = transform_points(ground, pose_of(sweep)).T
+        x, y, z = world_points(sweep, is_used).T
         cell = np.floor(np.stack([x, y], 1) / _CELL).astype(np.int64)
         first = cell.min(axis=0) - 1  # an empty border
         columns, rows = cell.max(axis=0) - first + 2

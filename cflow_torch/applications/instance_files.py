@@ -55,9 +55,7 @@ _DEFORMABLE = ("pedestrian", "cyclist")
 _PER_KEY_FRAME = 5  # frames of 10 Hz, from one key frame of nuScenes to the next
 
 
-def write_drivestudio(
-    folder: PathLike, table: Table, log: Log, class_name: str = CLASSES[0], deformable_class: str | None = None
-) -> None:
+def write_drivestudio(folder: PathLike, table: Table, log: Log, data_set: str = "") -> None:
     """Write `folder/instances_info.json` and `folder/frame_instances.json`.
 
     The first has, for each track, the frames in which it is seen, `T_world_box` (4, 4) and length, width, height in
@@ -69,14 +67,15 @@ def write_drivestudio(
         log: the drive. Frames are its sweeps, and boxes are in the world of its poses. In a scene of nuScenes, frames
             are its key frames and four times between each two of them, as DriveStudio prepares it at 10 Hz
             (`interpolate_N=4`). Each has the boxes of the sweep that is nearest in time.
-        class_name: class of the objects. DriveStudio chooses the kind of model by it.
-        deformable_class: class of pedestrians and cyclists; None = `class_name`. We do not use a class of pedestrians,
-            for which DriveStudio needs poses of their bodies.
+        data_set: name of the reader of the log. By the class of an object, DriveStudio chooses the kind of its model.
+            We take the classes of `CLASSES_OF_READER`, or `CLASSES` for other logs. We do not use a class of
+            pedestrians, for which DriveStudio needs poses of their bodies.
 
     Convention: instances are numbered 0, 1, 2, ... without gaps, in the order of the ids of their tracks. `id` is the
         id of the track. A box has x along its length, y to the left and z up.
     """
     folder = as_path(folder)
+    rigid_class, deformable_class = CLASSES_OF_READER.get(data_set, CLASSES)
     sweep_of_frame = _sweep_of_frames(log)
     frame, row = np.nonzero(sweep_of_frame[:, None] == table["sweep"])
     ids, instance = np.unique(table["id"][row], return_inverse=True)
@@ -86,10 +85,9 @@ def write_drivestudio(
     for number, track_id in enumerate(ids.tolist()):
         is_here = instance == number
         rows = row[is_here]
-        is_deformable = table["class"][rows[0]] in _DEFORMABLE
         infos[str(number)] = {
             "id": str(track_id),
-            "class_name": deformable_class if is_deformable and deformable_class is not None else class_name,
+            "class_name": deformable_class if table["class"][rows[0]] in _DEFORMABLE else rigid_class,
             "frame_annotations": {
                 "frame_idx": frame[is_here].tolist(),
                 "obj_to_world": boxes[rows].tolist(),

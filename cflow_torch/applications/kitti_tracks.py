@@ -13,6 +13,7 @@ from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import SIZE, vectors
 
+KITTI_FILE = "kitti.txt"
 _AHEAD = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 _ANNOTATED_CAMERA = "image_02"
 
@@ -26,16 +27,17 @@ class _Boxes(NamedTuple):
     is_seen: np.ndarray  # (R,) bool
 
 
-def write_kitti(path: PathLike, table: Table, log: Log) -> None:
-    """Write tracks as text of KITTI's tracking benchmark: a line of 18 columns per row.
+def write_kitti(folder: PathLike, table: Table, log: Log, data_set: str = "") -> None:
+    """Write tracks as `folder/kitti.txt`, text of KITTI's tracking benchmark: a line of 18 columns per row.
 
     Frames are numbered by `Log.frame_number`, ids from 0; unknown columns are -1.
 
     Args:
-        path: the file.
+        folder: created if it does not exist.
         table: tracks, see `track`.
         log: the drive. If it is a drive of KITTI with its calibration, boxes are in the frame of KITTI's labels, the
             rectified camera 0, have rectangles in the image of camera 2, and are left out where it does not see them.
+        data_set: ignored.
 
     Convention: KITTI's camera has x to the right, y down, z ahead. Without calibration, it is at the origin of the
         ego frame of the sweep and looks to +x. The position is the middle of the lower face of the box.
@@ -53,7 +55,7 @@ def write_kitti(path: PathLike, table: Table, log: Log) -> None:
         values = " ".join(f"{value:.6f}" for value in numbers[row])
         frame = log.frame_number(int(table["sweep"][row]))
         lines.append(f"{frame} {table['id'][row]} {kind} -1 -1 {values}\n")
-    write_text(as_path(path), "".join(lines))
+    write_text(as_path(folder) / KITTI_FILE, "".join(lines))
 
 
 def _seen_by_camera(table: Table, log: Log, size: np.ndarray) -> _Boxes:

@@ -1,9 +1,10 @@
 """Write labels for self-supervised training into OpenSceneFlow's scenes: moving points, and groups of points.
 
-A group moves if some of its points move (`FlowResult.is_moving`), and the mean confidence of these points
-plus their agreement is at least `AGREEMENT`. The agreement, 0 ... 1, is the share of these points for which we find a
-similar motion at the predicted position, averaged over the sweeps before and after. False motion of a single window
-(leaves, edges that come into view) rarely passes.
+A group moves if some of its points have a flow of at least `MOVING`, and the mean confidence of these points plus their
+agreement is at least `AGREEMENT`. The agreement, 0 ... 1, is the share of these points for which we find a similar
+motion at the predicted position, averaged over the sweeps before and after. False motion of a single window (leaves,
+edges that come into view) rarely passes. Like tracks, labels do not ask for P(moving), because several sweeps tell more
+than one.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any, Callable, Iterable, Iterator, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.applications.moving_groups import pose_of
+from cflow_torch.applications.moving_groups import MOVING, pose_of, world_points
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5.writer import write_hdf5_labels
 from cflow_torch.data.log import CachedLog, Log, window
@@ -33,7 +34,7 @@ _NND = (0.14, 4.4)  # metres from a point to the nearest one of the next sweep: 
 
 
 class DynamicPoints(NamedTuple):
-    """The M points of a sweep that move according to its flow."""
+    """The M points of a sweep with a flow of at least `MOVING`."""
 
     rows: np.ndarray  # (M,) int64
     positions: np.ndarray  # (M, 3) float64, metres, world
@@ -78,7 +79,7 @@ def find_labels(
     Yields:
         (time stamp, labels), in order. The labels of N points are:
         `ground_mask` (N,) bool.
-        `dufo` (N,) uint8, 1 = moves (`FlowResult.is_moving`), in a moving group; 0 for ground.
+        `dufo` (N,) uint8, 1 = has a flow of at least `MOVING`, in a moving group; 0 for ground.
         `cluster` (N,) int16, moving groups and groups of at least 20 points; 0 = ground or no group. Moving groups have
         the first numbers, from 1, because `seflowpp_auto` keeps numbers in 8 bits.
         `dufocluster` (N,) int16, `cluster` where `dufo` is 1, else 0.
@@ -181,12 +182,11 @@ def _dynamic_points(sweep: Sweep, other: Sweep, result: FlowResult, seconds: np.
     """Collect the moving points of a sweep whose flow leads to another one; `seconds` are the times of both."""
     residual = as_numpy(result.residual_flow, np.float64)
     group = as_numpy(result.cluster_id)
-    rows = np.flatnonzero(as_numpy(result.is_moving) & (group >= 0))
+    rows = np.flatnonzero((np.linalg.norm(residual, axis=1) >= MOVING) & (group >= 0))
     interval = seconds[1] - seconds[0]  # negative where the flow leads to the sweep before
     velocity = residual[rows] @ pose_of(other)[:3, :3].T / interval
     confidence = as_numpy(result.confidence, np.float64)[rows]  # type: ignore[arg-type]  # checked before
-    positions = transform_points(as_numpy(sweep.points)[rows, :3], pose_of(sweep))
-    return DynamicPoints(rows, positions, velocity, group[rows], confidence, float(seconds[0]))
+    return DynamicPoints(rows, world_points(sweep, rows), velocity, group[rows], confidence, float(seconds[0]))
 
 
 def _is_confirmed(dynamic: Sequence[DynamicPoints], trees: Sequence[Any], index: int) -> np.ndarray:

@@ -8,13 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.association import MARGIN, MIN_STOPPED_SHARE, box_of_point, enclosing_boxes
+from cflow_torch.applications.association import MARGIN, MIN_STOPPED_SHARE, enclosing_boxes, points_in_boxes
 from cflow_torch.applications.completion import TrackedPoints
 from cflow_torch.applications.floor import Floor
-from cflow_torch.applications.moving_groups import MIN_POINTS, pose_of
+from cflow_torch.applications.moving_groups import MIN_POINTS, pose_of, world_points
 from cflow_torch.applications.static_places import cells_of
 from cflow_torch.applications.track_table import Table
-from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep, as_numpy
 
 
@@ -31,17 +30,14 @@ class FreePoints(NamedTuple):
         is_free = is_valid & np.isfinite(cloud).all(axis=1)
         is_free[taken] = False
         row = np.flatnonzero(is_free)
-        position = transform_points(cloud[row], pose_of(sweep))
+        position = world_points(sweep, row)
         order = np.argsort(position[:, 0])
         return cls(row[order], position[order])
 
     def inside(self, centre: Tensor, size: Tensor, heading: Tensor) -> np.ndarray:
         """(M,) int64 indices of the points in a box, see `box_of_point`."""
-        reach = float(size[0, :2].norm()) / 2
-        x = float(centre[0, 0])
-        first, last = np.searchsorted(self.position[:, 0], [x - reach, x + reach])
-        box = box_of_point(torch.from_numpy(self.position[first:last]), centre, size, heading)
-        return first + np.flatnonzero(box.numpy() == 0)
+        (index,) = points_in_boxes(torch.from_numpy(self.position), centre, size, heading)
+        return index.numpy()
 
     def without(self, index: np.ndarray) -> FreePoints:
         """Remove points by their indices."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from cflow_torch.ops.indices import unique_pairs
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import MOVING as MOVING
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
@@ -81,3 +83,8 @@ class MovingGroups:
 def pose_of(sweep: Sweep) -> np.ndarray:
     """(4, 4) float64 `T_world_ego` of a sweep; the identity if it has no pose."""
     return np.eye(4) if sweep.pose is None else as_numpy(sweep.pose, np.float64)
+
+
+def world_points(sweep: Sweep, rows: Any = ...) -> np.ndarray:
+    """(N, 3) float64 points of a sweep, or those of some rows, metres, in the world."""
+    return transform_points(as_numpy(sweep.points)[rows, :3], pose_of(sweep))

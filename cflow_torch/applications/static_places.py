@@ -41,29 +41,51 @@ def static_points(sightings: list[Sighting]) -> list[np.ndarray]:
 
     Returns:
         (P,) bool for each sighting.
+
+    Cost: memory for the points, not for each cell in each sweep.
     """
-    count = len(sightings)
     cells = [cells_of(each.position) for each in sightings]
     cell, first = np.unique(np.concatenate(cells), return_index=True)
     place = np.concatenate([each.position for each in sightings])[first]
-    is_near = np.stack([_is_near(place, each.position) for each in sightings], 1)  # [V, S]
-    is_full = np.stack([np.isin(cell, each.static, assume_unique=True) for each in sightings], 1)  # [V, S]
-    order = np.arange(count)
-    comes = np.where(is_near, order, count).min(1)[:, None]
-    leaves = np.where(is_near, order, -1).max(1)[:, None]
-    is_before = (order < comes) & (order >= comes - _NEAR)
-    is_after = (order > leaves) & (order <= leaves + _NEAR)
-    is_static = _is_often(is_full, is_before) & _is_often(is_full, is_after) & (is_before | is_after).any(1)
+    comes, leaves = _visits(place, sightings)
+    full_before, num_before = _count_full(cell, comes - _NEAR, sightings)
+    full_after, num_after = _count_full(cell, leaves + 1, sightings)
+    is_seen_elsewhere = num_before + num_after > 0
+    is_static = (full_before >= _SHARE * num_before) & (full_after >= _SHARE * num_after) & is_seen_elsewhere
     return [is_static[np.searchsorted(cell, each)] for each in cells]
 
 
-def _is_near(place: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(V,) bool: the (V, 3) places are in the box around (P, 3) points along the axes of the world, or nearly."""
-    low = points[:, :2].min(0) - _APART
-    high = points[:, :2].max(0) + _APART
-    return ((place[:, :2] >= low) & (place[:, :2] <= high)).all(1)
+def _visits(place: np.ndarray, sightings: list[Sighting]) -> tuple[np.ndarray, np.ndarray]:
+    """(V,) int64 each: the first and the last sighting whose points have the (V, 3) places in the box around them.
+
+    The box is along the axes of the world, and a little larger.
+    """
+    comes = np.full(len(place), len(sightings))
+    leaves = np.full(len(place), -1)
+    by_x = np.argsort(place[:, 0])
+    x = place[by_x, 0]
+    for number, each in enumerate(sightings):
+        low = each.position[:, :2].min(0) - _APART
+        high = each.position[:, :2].max(0) + _APART
+        rows = by_x[np.searchsorted(x, low[0]) : np.searchsorted(x, high[0], side="right")]
+        rows = rows[(place[rows, 1] >= low[1]) & (place[rows, 1] <= high[1])]
+        comes[rows] = np.minimum(comes[rows], number)
+        leaves[rows] = number
+    return comes, leaves
 
 
-def _is_often(is_full: np.ndarray, is_counted: np.ndarray) -> np.ndarray:
-    """(V,) bool: a cell is full in enough of the counted sweeps, or none is counted."""
-    return (is_full & is_counted).sum(1) >= _SHARE * is_counted.sum(1)
+def _count_full(cell: np.ndarray, first: np.ndarray, sightings: list[Sighting]) -> tuple[np.ndarray, np.ndarray]:
+    """Count the sightings that have points without a track in each of V cells, among the `_NEAR` from `first` on.
+
+    Returns this number and that of all sightings there, (V,) int64 each.
+    """
+    num_full = np.zeros(len(cell), np.int64)
+    num_all = np.zeros(len(cell), np.int64)
+    by_first = np.argsort(first)
+    ascending = first[by_first]
+    for number, each in enumerate(sightings):
+        begin, end = np.searchsorted(ascending, [number - _NEAR, number], side="right")
+        rows = by_first[begin:end]
+        num_full[rows] += np.isin(cell[rows], each.static, assume_unique=True)
+        num_all[rows] += 1
+    return num_full, num_all

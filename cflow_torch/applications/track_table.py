@@ -19,6 +19,7 @@ from cflow_torch.types import CENTRE, SIZE, VELOCITY, vectors
 
 Table = Dict[str, np.ndarray]
 TRACKS_FILE = "tracks.parquet"  # next to the flow files of a log
+MOT_FILE = "mot.txt"
 _INTEGERS = ("sweep", "timestamp_ns", "id", "num_moving", "cluster_id", "num_points")
 _FLOATS = (*CENTRE, *VELOCITY, "velocity_std", *SIZE, "heading", "age", "confidence")
 COLUMNS = {
@@ -65,14 +66,21 @@ def read_tracks(path: PathLike) -> Table:
     return {name: table.column(name).to_numpy().astype(dtype) for name, dtype in COLUMNS.items()}
 
 
-def write_mot(path: PathLike, table: Table, log: Log) -> None:
-    """Write tracks as text of the MOT Challenge 3D: lines `frame,id,-1,-1,-1,-1,confidence,x,y,z`.
+def write_mot(folder: PathLike, table: Table, log: Log, data_set: str = "") -> None:
+    """Write tracks as `folder/mot.txt` of the MOT Challenge 3D: lines `frame,id,-1,-1,-1,-1,confidence,x,y,z`.
 
     Frames and ids count from 1; x, y, z is the centre of the box, metres in the world; confidence is 1 where the method
-    has none. The log is not used.
+    has none. The log and its data set are ignored.
     """
     columns = (table["sweep"] + 1, table["id"] + 1, score_of(table))
-    _write_lines(path, "%d,%d,-1,-1,-1,-1,%.3f,%.3f,%.3f,%.3f", *columns, table["x"], table["y"], table["z"])
+    _write_lines(
+        as_path(folder) / MOT_FILE,
+        "%d,%d,-1,-1,-1,-1,%.3f,%.3f,%.3f,%.3f",
+        *columns,
+        table["x"],
+        table["y"],
+        table["z"],
+    )
 
 
 def score_of(table: Table) -> np.ndarray:

@@ -82,9 +82,10 @@ class Tracker:
     """Track moving objects sweep by sweep.
 
     The flow moves the points of a group to the next sweep. There, the group that shares the most voxels with them is
-    the same object. We track a stopped object as long as there are points in its box. If an object is not seen for up
-    to three sweeps, we predict its position from its velocity. We do the same if sweeps are missing, for up to three
-    intervals or one second, whichever is longer. Memory: the points of the current tracks.
+    the same object. We track a stopped object as long as its box holds at least 5 static points, and 0.3 of those that
+    it had. If an object is not seen for up to three sweeps, we predict its position from its velocity. We do the same
+    if sweeps are missing, for up to three intervals or one second, whichever is longer. Memory: the points of the
+    current tracks.
 
     Args:
         sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
@@ -466,8 +467,12 @@ class LogTracker:
         A track is not seen in a sweep where most of its points are static. If this is so in most of the sweeps in which
         it moves, it is not a track.
         """
+        sweeps_of: dict[int, list[SweepTracks]] = {}
+        for each in self._sweeps:
+            for number in np.unique(each.points.id).tolist():
+                sweeps_of.setdefault(number, []).append(each)
         for number in np.unique(self._confirmed()["id"]).tolist():
-            sweeps = [each for each in self._sweeps if number in each.points.id]
+            sweeps = sweeps_of[number]
             seen = [Sighting(each.points.of_track(number)[0], each.static) for each in sweeps]
             is_static = static_points(seen)
             share = np.array([each.mean() for each in is_static])

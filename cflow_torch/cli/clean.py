@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any, Callable
@@ -20,7 +19,7 @@ from cflow_torch.data.arrays import ArraysLog
 from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.json_file import read_json
+from cflow_torch.data.json_file import read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
@@ -29,7 +28,7 @@ from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
 
 MAP_FILE = "map.ply"  # next to its picture, map.png
-_NEEDED = ("residual_flow", "cluster_id", "is_valid")  # of flow files
+_NEEDED = ("residual_flow", "cluster_id", "is_valid", "confidence", "moving")  # of flow files
 
 
 def task(cfg: Clean) -> None:
@@ -49,7 +48,7 @@ def task(cfg: Clean) -> None:
                 raise CFlowError(f"{folder} has another log of this run: rename one of two logs of this name")
             removed = "it is complete" if is_written.pop(log.log_id) else _write(cfg, log, output, clean)
             print(f"{folder}: {len(log.timestamps)} sweeps, {removed}{_how_to_read(log, cfg.suffix)}")
-            if cfg.map and not (folder / MAP_FILE).exists():
+            if cfg.map and not _has_map(cfg, folder):
                 print(_write_map(cfg, log, folder))
     finish(failures)
 
@@ -96,18 +95,24 @@ def _record(cfg: Clean, log: Log) -> dict[str, Any]:
 
 def _write(cfg: Clean, log: Log, output: Path, clean: Callable[[Log], CleanLog]) -> str:
     """Write the folder of a log in place of an older one of ours, and return what was removed."""
-    shutil.rmtree(output / log.log_id, ignore_errors=True)
     clean_log = clean(log)
-    removed = write_clean_log(clean_log, log, output, cfg.suffix, _record(cfg, log))
+    removed = write_clean_log(clean_log, log, output, cfg.suffix, _record(cfg, log), cfg.overwrite)
     if clean_log.num_stopped is None:
         return str(removed)
     return f"{removed}; remove_stopped removed {clean_log.num_stopped:,} of them"
 
 
+def _has_map(cfg: Clean, folder: Path) -> bool:
+    """Test whether the folder of a log has its map with these voxels."""
+    return (folder / MAP_FILE).exists() and read_json(folder / RECORD_FILE)["voxel_size"] == cfg.voxel_size
+
+
 def _write_map(cfg: Clean, log: Log, folder: Path) -> str:
-    """Write the map of a log into its folder, and return a line with its files."""
+    """Write the map of a log into its folder, in place of one with other voxels, and return a line with its files."""
     file = folder / MAP_FILE
     points, intensity = static_map_with_intensity(MaskedLog(log, stored_masks(folder, log)), cfg.voxel_size)
+    file.unlink(missing_ok=True)  # first, so that the record below is never that of another map
+    write_json(folder / RECORD_FILE, {**read_json(folder / RECORD_FILE), "voxel_size": cfg.voxel_size})
     write_cloud(file, points, None if intensity is None else {"intensity": intensity})
     return f"{file}: {len(points):,} points{_draw(points, log.log_id, file.with_suffix('.png'))}"
 

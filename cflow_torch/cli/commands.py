@@ -289,10 +289,11 @@ class Label(FlowFiles):
 class Eval(Command):
     """Estimates and scores all labelled pairs: tables on the screen, OUTPUT/results.json and OUTPUT/config.yaml.
 
-    A run whose results exist is not repeated, its tables are printed; overwrite=true repeats it. Each job of a sweep
-    (-m) writes to a folder below OUTPUT that is named after its swept settings. At the end of the sweep, a table
-    compares all jobs in OUTPUT; it is also written to OUTPUT/comparison.csv. A sweeper minimises the mean dynamic
-    error.
+    A run whose results exist for the same settings, versions and logs is not repeated, its tables are printed;
+    overwrite=true repeats it, for example with new labels. Each job of a sweep (-m) writes to a folder below OUTPUT
+    that is named after its swept settings. At the end of the sweep, a table compares all jobs in OUTPUT; it is also
+    written to OUTPUT/comparison.csv. A sweeper minimises the mean dynamic error; of definition=av2 the three-way
+    end-point error, of definition=mos 1 - IoU.
 
     examples:
       cflow eval data=av2 data.root=/data/av2/val model=paper
@@ -516,11 +517,12 @@ class Stream(Command):
 class Clean(Command):
     """Writes logs without dynamic objects: OUTPUT/<log id>, a folder of point clouds, poses, times and ground masks.
 
-    data=arrays reads such a folder. A point is dynamic if its flow is at least 0.05 m per sweep and P(moving) at least
-    0.5. Clouds of a folder keep their names, columns and types, and poses in VIEWPOINT. We also keep the other columns
-    of bags, Argoverse 2 and PandaSet, such as intensity. removed/NAME.npy has a bool per point of a sweep, True = not
-    in the clean cloud, and clean.json the settings. All files of a log are in its folder, which is written as a whole
-    or not at all. Run the command again to write the missing logs. Other files in OUTPUT stay.
+    data=arrays reads such a folder. A point is dynamic if its flow is at least 0.05 m per sweep. With the presets
+    default, offline and live, its P(moving) must also be at least 0.5. Clouds of a folder keep their names, columns and
+    types, and poses in VIEWPOINT; those of other data sets have the numbers of their sweeps. We also keep the other
+    columns of bags, Argoverse 2 and PandaSet, such as intensity. removed/NAME.npy has a bool per point of a sweep, True
+    = not in the clean cloud, and clean.json the settings. All files of a log are in its folder, which is written as a
+    whole or not at all. Run the command again to write the missing logs. Other files in OUTPUT stay.
 
     examples:
       cflow clean /data/drive map=true voxel_size=0.2            any recognised format, such as a bag
@@ -542,7 +544,7 @@ class Clean(Command):
     map: bool = setting(
         False, "also write the static points in the world, one per voxel, to <log id>/map.ply, and a picture", free=True
     )
-    voxel_size: float = _above_0(0.1, "side of a voxel of the map, in metres")
+    voxel_size: float = _above_0(0.1, "side of a voxel of the map, in metres", free=True)
 
 
 @dataclass(frozen=True)

@@ -77,15 +77,16 @@ def _put(path: Any, content: bytes) -> None:
 
 
 @contextmanager
-def new_folder(root: PathLike, name: str) -> Iterator[Path]:
+def new_folder(root: PathLike, name: str, replace: bool = False) -> Iterator[Path]:
     """Create the folder `root/name`, which takes its name when the block ends. If the block raises, we remove it.
 
-    If the folder exists or is remote, or its name is not safe, that is a `CFlowError`.
+    An older folder stays until then if you `replace` it. Else it is a `CFlowError`, and so are a remote folder and a
+    name that is not safe.
     """
     folder = as_path(root) / safe_name(name, "log_id")
     if is_remote(folder):
         raise CFlowError(f"{folder} is remote: write the folder on this machine and copy it there")
-    if folder.exists():
+    if folder.exists() and not replace:
         raise CFlowError(f"{folder} exists already: remove it, or choose another root")
     new = folder.with_name(_temporary_name(folder.name))
     try:
@@ -94,6 +95,8 @@ def new_folder(root: PathLike, name: str) -> Iterator[Path]:
         for path in new.rglob("*"):
             if path.is_file():
                 _sync(path)
+        if replace:
+            shutil.rmtree(folder, ignore_errors=True)
         os.replace(new, folder)
     finally:
         shutil.rmtree(new, ignore_errors=True)

@@ -3,7 +3,9 @@
 OUTPUT/<log id>/manifest.json     identity of the run: method, data settings, contents, versions; time stamps of the
                                   log, and digests of its first, middle and last sweep
 OUTPUT/<log id>/<ns>.feather      a frame; its file gets this name when it is complete
-OUTPUT/<log id>/tracks.parquet    moving objects of a log whose frames are all complete
+OUTPUT/<log id>/tracks.parquet    moving objects of a log whose frames are all complete; next to it the files of tracks=
+OUTPUT/<log id>/masks/<camera>/<image>.png             masks of dynamic objects of such a log
+OUTPUT/<log id>/dynamic_masks/<kind>/<frame>_<C>.png   those for DriveStudio
 OUTPUT/sequences/<log id>/predictions/<sweep>.label    moving points of such a log
 """
 

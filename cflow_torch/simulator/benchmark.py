@@ -19,8 +19,8 @@ from typing import Any, Callable, Mapping, Sequence
 from tqdm import tqdm
 
 from cflow_torch.data.catalog import find_sources
-from cflow_torch.data.hdf5.writer import write_hdf5_scene
-from cflow_torch.simulator.drive import Drive, drive_name, make_drive
+from cflow_torch.data.hdf5.writer import write_hdf5_log
+from cflow_torch.simulator.drive import drive_name, make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
 _HERE = Path(__file__).parent
@@ -32,7 +32,8 @@ class Format:
 
     Args:
         data_set: name of the reader in `catalog.DATA_SETS`.
-        write: function (drive, root) that writes the drive below an existing folder.
+        write: function (drive, root) that writes the drive below an existing folder. Drives are made again if its
+            module, or one next to it, changes.
         settings: options of the reader, for every drive.
     """
 
@@ -41,11 +42,7 @@ class Format:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 
-def _write_scene(drive: Drive, root: Path) -> None:
-    write_hdf5_scene(drive, root / f"{drive.log_id}.h5")
-
-
-AV2, HDF5 = Format("av2", write_av2_log), Format("hdf5", _write_scene)
+AV2, HDF5 = Format("av2", write_av2_log), Format("hdf5", write_hdf5_log)
 _OTHERS = ("nuscenes", "truckscenes", "waymo", "aevascenes")  # these data sets store more digits than Argoverse 2
 
 

@@ -358,16 +358,21 @@ class Columns:
     def fill(self, is_unknown: Tensor) -> None:
         """Set all bits where it is not known what a sweep would have, (C + 1, S) bool.
 
-        There, nothing is missing, and what is looked up is found, in place as well as at a target. The empty column
-        stays empty. The pixels that are drawn already stay as they are.
+        There, nothing is missing. A position without a column stays empty. The pixels that are drawn already stay as
+        they are.
         """
         filled = self.slices[1:, : is_unknown.shape[1]]
         filled |= is_unknown[1:].view(torch.uint8) * 255
 
-    def are_filled(self, pixels: Pixels, step: int) -> Tensor:
-        """Tell at which of K pixels another sweep has slices, but no pixel: (K,) bool, see `fill`."""
-        is_empty = self.rank[step].index_select(0, self.column_of(pixels)) == _EMPTY
-        return is_empty & (self.look_up(pixels, step) & OWN > 0)
+    def are_filled(self, pixels: Pixels, step: Tensor | int, shift: Tensor | None = None) -> Tensor:
+        """Tell where another sweep has slices, but no pixel, see `fill`: bool, with the arguments of `look_up`."""
+        has_slices = self.look_up(pixels, step, shift) & OWN > 0
+        first = step * len(self.position)  # entry of `rank`
+        if shift is None:
+            entry = self.column_of(pixels) + first  # [K]
+        else:
+            entry = self._column_at(pixels, shift) + (first[:, None] if isinstance(first, Tensor) else first)  # [K, C]
+        return has_slices & (self.rank.view(-1).index_select(0, entry.view(-1)).view_as(entry) == _EMPTY)
 
 
 def position_of(grid: Grid, window: int | Tensor, row: Tensor, col: Tensor) -> Tensor:

@@ -24,7 +24,8 @@ covariance of the voxels around both ends.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Callable, Iterator
+from functools import partial
+from typing import Callable
 
 import torch
 from torch import Tensor
@@ -191,9 +192,16 @@ class Source:
             elapsed=self.elapsed[some],
         )
 
-    def chunks(self) -> Iterator[Source]:
-        """Split the voxels into chunks that suit the device."""
-        return (self[some] for some in chunks(0, len(self), self.voxel.device, 9))
+    def sum_by_object(self, values_of: Callable[[Source], Tensor], num_rows: int) -> Tensor:
+        """Sum R values of each voxel over its object, (R, G) float64; the bits do not depend on chunks.
+
+        `values_of` computes the values of some of the voxels, (R, k), as many at once as suit the device.
+        """
+        sums = self.centre.new_zeros((num_rows, self.by_object.count + 1))
+        for some in chunks(0, len(self), self.voxel.device, 9):
+            source = self[some]
+            source.by_object.add_to(sums, values_of(source))
+        return sums[:, :-1]
 
     def sample(self, voxels: Voxels) -> Source:
         """Keep every n-th diagonal plane of voxels of each object; n is the least that keeps about `_SAMPLE`."""
@@ -256,21 +264,21 @@ class Registration:
         start = torch.cat((start, torch.zeros_like(start[:, :1])), 1).t()  # [3, G]
         motion = start  # x, y and the tangent of half the angle, per sweep interval
         for iteration in range(num_iterations):
-            hessian = held
-            right_side = prior * (start - motion)  # [3, G]
+            rigid = self._rigid(motion)
             source = self._sample if iteration < num_iterations // 2 else self._source
-            for some in source.chunks():
-                pairs = self._correspond(some, self._rigid(motion))
-                equations = pairs.by_object.sum(_normal_equations(pairs))  # [9, G]
-                hessian = hessian + equations[:6]
-                right_side = right_side + equations[6:]
-            change = matvec(full(inverse(hessian)), right_side)
+            equations = source.sum_by_object(partial(self._equations, rigid), 9)
+            right_side = prior * (start - motion) + equations[6:]  # [3, G]
+            change = matvec(full(inverse(held + equations[:6])), right_side)
             motion = torch.add(motion, change, alpha=STEP_LENGTH)
         return self._rigid(motion)
 
     def _rigid(self, motion: Tensor) -> RigidMotion:
         """Return the motion of the objects from its parameters, (3, G): x, y and the tangent of half the angle."""
         return RigidMotion(motion[:2].t(), motion[2], self._centre.nan_to_num(0.0).t())
+
+    def _equations(self, rigid: RigidMotion, source: Source) -> Tensor:
+        """Return the normal equations of each voxel of the source, (6 + 3, K) float64."""
+        return _normal_equations(self._correspond(source, rigid))
 
     def _correspond(self, source: Source, rigid: RigidMotion) -> Correspondences:
         """Move the source to t+1, and find the nearest voxels of the target."""
@@ -318,11 +326,12 @@ class Registration:
         """
         source = self._source[flat_nonzero(self._source.by_object.spread(asked))]
         static = rigid.only(torch.zeros_like(asked))
-        sums = torch.zeros((3, len(asked)), dtype=torch.float64, device=asked.device)
-        for some in source.chunks():
+
+        def gains(some: Source) -> Tensor:
             gain = self._correspond(some, rigid).weight - self._correspond(some, static).weight
-            sums = sums + some.by_object.sum(torch.stack((gain, gain.square(), torch.ones_like(gain))))
-        gain, square, count = sums
+            return torch.stack((gain, gain.square(), torch.ones_like(gain)))
+
+        gain, square, count = source.sum_by_object(gains, 3)
         return (gain > _SLOW_Z * square.sqrt()) & (gain >= _LEAST_GAIN * count)
 
     def stretch(self, rigid: RigidMotion) -> Tensor:
@@ -339,13 +348,14 @@ class Registration:
         """
         time = self._voxels.time
         assert time is not None
-        sums = torch.zeros_like(self._centre)
-        for source in self._source.chunks():
+
+        def times(source: Source) -> Tensor:
             pairs = self._correspond(source, rigid)
             delay = time.index_select(0, pairs.target) - time.index_select(0, pairs.source)
             weight = (pairs.information[0, 0] + pairs.information[1, 1]) * pairs.elapsed
-            sums = sums + pairs.by_object.sum(weight * torch.stack((pairs.elapsed, delay)))
-        square, late = sums
+            return weight * torch.stack((pairs.elapsed, delay))
+
+        square, late = self._source.sum_by_object(times, 2)
         stretch = torch.where(square > 0, 1 + late / square, 1.0)
         return torch.where(stretch < _LEAST_STRETCH, 1.0, stretch)
 

@@ -85,12 +85,9 @@ def _are_beyond(distance: Tensor, grid: Grid, window: Tensor, row_col: Tensor) -
 
     `distance` is (B,) float64, pixels, to the middle of a pixel; it may be infinite.
     """
-    middle = constant(tuple(lower / grid.pixel_size + 0.5 for lower in grid.lower[1::-1]), torch.float32, window.device)
-    y, x = row_col.float() + middle[:, None]
-    square = distance.clamp(min=0).square().index_select(0, window)
-    # In its row, a pixel is beyond if its column is farther than this from the middle.
-    beyond = (square - y.double().square()).clamp_(min=0).sqrt_()
-    return x.abs() > beyond.float()
+    middle = constant(tuple(lower / grid.pixel_size + 0.5 for lower in grid.lower[1::-1]), torch.float64, window.device)
+    from_origin = row_col + middle[:, None]  # [2, K]
+    return from_origin.square().sum(0) > distance.clamp(min=0).square().index_select(0, window)
 
 
 def _median_gaps(batch: Batch) -> tuple[Tensor, Tensor]:

@@ -204,8 +204,10 @@ def _judge(sweeps: HeightSlicedSweeps, window: Tensor, error: Tensor, moved: Ten
     is_found = is_given & (error <= limit)
     is_in_half = 2 * is_found[:, 2:].sum(1) >= is_given[:, 2:].sum(1)
     is_confirmed = is_found[:, 0] & (is_found[:, 2:3].any(1) | is_in_half)
-    cost = ((error / limit).square().clamp(max=1.0) * is_given).sum(1)
-    cost += moved[:, 0] * ~sweeps.has_history.index_select(0, window)
+    cost = moved[:, 0] * ~sweeps.has_history.index_select(0, window)
+    # One after the other: sweeps that the window lacks would change the last bits of a sum over a row.
+    for of_sweep in ((error / limit).square().clamp(max=1.0) * is_given).unbind(1):
+        cost = cost + of_sweep
     return is_found, cost.masked_fill(~is_confirmed, math.inf)
 
 

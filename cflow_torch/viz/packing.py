@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import zlib
-from typing import Any, Mapping, Sequence
+from typing import Any, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -139,14 +139,21 @@ class PackedDrive:
                 if number >= 0:
                     entries["object"][cluster == number] = FIRST + track % len(PALETTE)
 
-    def content(self) -> dict[str, Any]:
-        """The input of the page's script: frames, colourings, and the points of each frame, compressed."""
+    def clouds(self) -> Iterator[str]:
+        """The points of each frame and their entries in the colourings of `content`, compressed, as texts."""
+        names = [coloring["name"] for coloring in self._chosen_colorings()]
+        for units, entries, _ in self.points:
+            missing = np.where(entries["flow"] == GROUND, GROUND, UNKNOWN).astype(np.uint8)
+            yield packed(_planes(units, [entries.get(name, missing) for name in names]))
+
+    def _chosen_colorings(self) -> list[dict[str, Any]]:
         interval = float(np.median([frame["interval"] for frame in self.frames]))
         present = set().union(*(entries for _, entries, _ in self.points))
-        chosen = [row for row in _colorings(self.max_flow, interval) if row["name"] in present]
-        for frame, (units, entries, _) in zip(self.frames, self.points):
-            missing = np.where(entries["flow"] == GROUND, GROUND, UNKNOWN).astype(np.uint8)
-            frame["data"] = packed(_planes(units, [entries.get(c["name"], missing) for c in chosen]))
+        return [row for row in _colorings(self.max_flow, interval) if row["name"] in present]
+
+    def content(self) -> dict[str, Any]:
+        """The input of the page's script: frames without their points, colourings, and texts."""
+        chosen = self._chosen_colorings()
         shown = sum(frame["count"] for frame in self.frames)
         side = self.voxel
         T = self.frame.T_world_viewer
@@ -159,7 +166,7 @@ class PackedDrive:
             "ego": EGO_OUTLINE,
             "north": None if T is None else float(np.arctan2(T[1, 1], T[1, 0])),  # of the world's y axis, viewer frame
             "steps": ARROW_STEPS,
-            "chances": _STEPS if "moving" in present else 0,
+            "chances": _STEPS if any(each["name"] == "moving" for each in chosen) else 0,
             "likely": MIN_MOVING,
             "thinned": f"{shown:,} of {self.num_given:,} points are drawn: all that move, by estimate or truth, all "
             f"with an error above {MIN_ERROR:g} m, and one other point per voxel of {side:g} m ({2 * side:g} m on the "

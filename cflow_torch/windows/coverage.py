@@ -14,7 +14,7 @@ from cflow_torch.ops.indices import mark
 
 _HALF = 90  # bins of each half of the circle, ahead and behind; a bin has 1.3 to 2.5 degrees
 _CIRCLE = 2 * (_HALF + 1)  # the last bin of each half is the y axis
-_SHORTEST = 16  # bins, 20 to 40 degrees; fewer empty bins in a row are a gap between objects
+_SHORTEST = 16  # bins, 21 to 40 degrees; fewer empty bins in a row are a gap between objects
 
 
 class Coverage:

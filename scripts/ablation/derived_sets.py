@@ -1,9 +1,9 @@
-"""Derive sets from a real one: longer steps with chained labels, static components pasted next to moving objects."""
+"""Derive sets: longer steps with chained labels, static components pasted next to moving objects, partial sweeps."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Sequence, Tuple
+from typing import Callable, Mapping, Sequence, Tuple
 
 import numpy as np
 from scipy import ndimage
@@ -25,6 +25,13 @@ DYNAMIC_POINTS, STATIC_POINTS = 20, 80  # least of a moving object; of a pasted 
 LONGER_SIDE = (0.6, 4.0)  # metres, of a pasted component
 REACH, PIXEL = 34.0, 0.1  # metres: half side of the square in which we search components; side of its pixels
 SQUARE = np.ones((3, 3), bool)
+# Which azimuths, (N,) degrees, a sweep of a drive measures, by its index and that of sweep t.
+CUTS: Mapping[str, Callable[[np.ndarray, int, int], np.ndarray]] = {
+    "front": lambda azimuth, index, t: np.abs(azimuth) < 35,
+    "turning": lambda azimuth, index, t: (azimuth - 15 * index) % 360 < 120,
+    "older": lambda azimuth, index, t: (azimuth < 0) | (index >= t),
+    "quarter": lambda azimuth, index, t: (azimuth < 0) | (azimuth > 90) | (index % 3 > 0),
+}
 
 
 def chain_flow(pairs: Sequence[Labelled], pose_flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -125,6 +132,12 @@ def _append(sweep: Sweep, points: np.ndarray) -> Sweep:
     """Append points that are not ground."""
     is_ground = np.concatenate([sweep.is_ground, np.zeros(len(points), bool)])
     return replace(sweep, points=np.concatenate([sweep.points, points.astype(np.float32)]), is_ground=is_ground)
+
+
+def cut_sweep(sweep: Sweep, cut: str, index: int, t: int) -> tuple[Sweep, np.ndarray]:
+    """Keep the points that a sweep has in some azimuths, see `CUTS`. Also return which these are, (N,) bool."""
+    kept = CUTS[cut](np.degrees(np.arctan2(sweep.points[:, 1], sweep.points[:, 0])), index, t)
+    return Sweep(sweep.points[kept], is_ground=sweep.is_ground[kept], pose=sweep.pose), kept
 
 
 def with_noisy_poses(given: Window, seed: int) -> Window:

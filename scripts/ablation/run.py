@@ -8,10 +8,10 @@
 
 Sets: real (CFLOW_DATA, else ../shared/data), odd (the other windows of the same KITTI drive), merged (a car under a
 tree crown, a later part of KITTI), pandaset, scenes (small simulated drives, a window for each of five seeds), sim
-(simulated drives of five sensors, h = 4, and their mean), motorway (the same on simulated motorways). We chose settings
-on seeds 100-103, those of fast objects on motorways 820-821, and checked the choice on
-400-403; use 300 and above for final scores only. Every setting has the history and the region of the set unless --set
-changes them; scenes have the region of the preset.
+(simulated drives of five sensors, h = 4, and their mean), motorway (the same on simulated motorways), cut (simulated
+streets whose sweeps measure a part of the circle). We chose settings on seeds 100-103, those of fast objects on
+motorways 820-821, and checked the choice on 400-403; use 300 and above for final scores only. Every setting has the
+history and the region of the set unless --set changes them; scenes have the region of the preset.
 
 Columns: end-point errors in metres over all points within 35 m ("border": 76.8 m) without ground; for scenes, means
 over the drives. dynamic: objects that move by at least 0.05 m per sweep; in a scene, its scored objects. pedestrian:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Callable, NamedTuple, Sequence
 
 import numpy as np
-from derived_sets import chain_flow, paste_static, with_noisy_poses, with_refined_poses
+from derived_sets import CUTS, chain_flow, cut_sweep, paste_static, with_noisy_poses, with_refined_poses
 
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.av2 import AV2Log
@@ -40,8 +40,9 @@ PROFILES = ("av2", "nuscenes", "truckscenes", "waymo", "aevascenes")
 SCENES = ("street", "highway", "crossing", "narrow")
 SIMULATED_SWEEPS, SIMULATED_WINDOWS = 15, (9, 12)  # per drive
 MOTORWAY_SWEEPS = 8
+CUT_PAIRS = (5, 6, 7, 8)  # of each drive whose sweeps are cut
 SCENE_SEEDS = (0, 1, 2, 3, 4)  # of the small drives
-GROUPS = ("real", "odd", "merged", "pandaset", "poses", "scenes", "sim", "motorway")
+GROUPS = ("real", "odd", "merged", "pandaset", "poses", "scenes", "sim", "motorway", "cut")
 AV2 = DATA / "av2-7fab2350" / "val" / "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
 KITTI, KITTI_LATER = (DATA / "kitti-0000" / f"kitti-0000-{part}.h5" for part in ("a", "c2"))
 CROWN = DATA / "av2-crown" / "av2-crown.h5"
@@ -78,8 +79,8 @@ class ScoredSet:
 def make_sets(names: Sequence[str], seeds: Sequence[range]) -> list[ScoredSet]:
     """Return the sets of some names, of groups or of single sets; "walkers" selects "walkers-0.1" and so on.
 
-    Sets of "sim" and "motorway" are returned once per range of seeds. For "sim", four seeds, or a multiple, have an
-    even mix of scenes. Simulated drives that are not in the cache are made.
+    Sets of "sim", "motorway" and "cut" are returned once per range of seeds. For "sim", four seeds, or a multiple, have
+    an even mix of scenes. Simulated drives that are not in the cache are made.
     """
     # With history, only windows with the whole history.
     sets = [
@@ -108,6 +109,9 @@ def make_sets(names: Sequence[str], seeds: Sequence[range]) -> list[ScoredSet]:
             sets.append(ScoredSet(name, "sim", partial(simulated, profile, drawn), half_side=REGION, mean=mean))
             name, mean = (f"motorway {word}{drawn[0]}-{drawn[-1]} h={HISTORY}" for word in (f"{profile} ", ""))
             sets.append(ScoredSet(name, "motorway", partial(motorway, profile, drawn), half_side=REGION, mean=mean))
+        for cut in CUTS:
+            name = f"cut {cut} {drawn[0]}-{drawn[-1]} h={HISTORY}"
+            sets.append(ScoredSet(name, "cut", partial(cut_drives, cut, drawn), half_side=None))
     for name in names:
         if not any(_is_of(scored, name) for scored in sets):
             raise CFlowError(f"set {name!r} does not exist; give {', '.join((*GROUPS, *(s.name for s in sets)))}")
@@ -210,6 +214,22 @@ def motorway(profile: str, seeds: Sequence[int]) -> list[Item]:
         log = CachedLog(make_drive(seed, MOTORWAY_SWEEPS, profile, "highway"), MOTORWAY_SWEEPS)
         index = MOTORWAY_SWEEPS - 2 - 1
         items.append(make_item(window(log, index, HISTORY), log.labels(index)))
+    return items
+
+
+def cut_drives(cut: str, seeds: Sequence[int]) -> list[Item]:
+    """Windows of simulated streets whose sweeps measure a part of the circle, see `CUTS`."""
+    items = []
+    for seed in seeds:
+        log = CachedLog(make_drive(seed, CUT_PAIRS[-1] + 2, "demo", "street"), CUT_PAIRS[-1] + 2)
+        for pair in CUT_PAIRS:
+            given = window(log, pair, HISTORY)
+            indices = (pair, pair + 1, *range(pair - 1, -1, -1))  # in the order of the sweeps of a window
+            partial_sweeps = [cut_sweep(sweep, cut, index, pair) for sweep, index in zip(given.sweeps, indices)]
+            kept = partial_sweeps[0][1]
+            labels = log.labels(pair)
+            labels = FlowLabels(labels.flow[kept], labels.category[kept], labels.is_valid[kept])
+            items.append(make_item(given.with_sweeps(sweep for sweep, _ in partial_sweeps), labels))
     return items
 
 

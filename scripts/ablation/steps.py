@@ -3,6 +3,7 @@
 
   python scripts/ablation/steps.py                     simulated seeds 700-703 of two sensors, odd windows of KITTI
   python scripts/ablation/steps.py --sets bridge tram   other sets of sets.py; --seeds selects others
+  python scripts/ablation/steps.py --without coverage   only all steps, and all but this one
 
 The columns are those of run.py.
 """
@@ -102,8 +103,13 @@ def score_without(scored: ScoredSet, name: str) -> Figures:
 
 def main() -> None:
     sets = ["sim av2 700-703 h=4", "sim waymo 700-703 h=4", "kitti odd h=4"]
-    given = make_parser(__doc__, sets, range(700, 704)).parse_args()
-    settings = {name: partial(score_without, name=name) for name in (*STEPS, *SETTINGS)}
+    parser = make_parser(__doc__, sets, range(700, 704))
+    names = [*STEPS, *SETTINGS]
+    parser.add_argument("--without", choices=[name[3:] for name in names if name[:3] == "no "], help="one of the steps")
+    given = parser.parse_args()
+    if given.without is not None:
+        names = ["all steps", f"no {given.without}"]
+    settings = {name: partial(score_without, name=name) for name in names}
     print_table(make_sets(given.sets, given.seeds), settings)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,10 @@ from command_line import cflow
 from pyarrow import feather, parquet
 from staged_cars import Staged, straight
 
-from cflow_torch import CFlowError, CleanLog, make_model
+from cflow_torch import CFlowError, CleanLog, Sweep, make_model
 from cflow_torch.applications.clean_files import stored_masks, write_clean_log
 from cflow_torch.applications.cleaning import MaskedLog, static_map_with_intensity
-from cflow_torch.data.arrays import ArraysLog
+from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, copy_rows, read_cloud, write_cloud
 
 DRIVE = Staged([straight((1, 1), (0.9, 0.0), 4)])
@@ -159,6 +160,29 @@ def test_a_map_has_the_intensities_of_its_points(tmp_path: Path) -> None:
     assert static_map_with_intensity(without, 0.4)[1] is None
 
 
+class Numbered(Staged):
+    """Sweeps 4, 5, 6, 8, 9 of a data set, without time stamps."""
+
+    def sweep(self, index: int) -> Sweep:
+        return replace(super().sweep(index), timestamp_ns=None)
+
+    def frame_number(self, index: int) -> int:
+        return (4, 5, 6, 8, 9)[index]
+
+
+def test_clouds_of_other_logs_have_the_numbers_of_the_data_set(tmp_path: Path) -> None:
+    log = Numbered([straight((1, 1), (0.9, 0.0), 5)], np.tile(np.eye(4), (5, 1, 1)))
+    numbers = [f"00000{number}.npy" for number in (4, 5, 6, 8, 9)]
+    write_clean_log(CleanLog(log, flow=log.result), log, tmp_path / "clean")
+    written = [tmp_path / "clean" / "staged", write_array_log(log, tmp_path / "all")]
+    assert sorted(file.name for file in (written[0] / "removed").iterdir()) == numbers
+    assert stored_masks(written[0], log)(3).any()
+    for folder in (*written, write_array_log(ArraysLog(written[1]), tmp_path / "again")):
+        back = ArraysLog(folder)
+        assert [file.name for file in back.files] == numbers
+        assert back.gaps == {2} and back.sweep_times() == pytest.approx([0, 0.1, 0.2, 0.4, 0.5])
+
+
 def test_a_mask_of_another_sweep_is_an_error(tmp_path: Path) -> None:
     write_drive(tmp_path / "drive", ".npy")
     with pytest.raises(CFlowError, match="the mask 3"):
@@ -193,7 +217,14 @@ def test_the_command_counts_what_it_removes_and_writes_a_map_that_is_missing(
         assert "data.bin_columns=5" in text
         file = tmp_path / "clean" / "drive" / "map.ply"
         assert b"property float intensity" in file.read_bytes()[:300]
+        older = file.read_bytes()
         file.unlink()
+    clean = ("clean", tmp_path / "drive", f"output={tmp_path / 'clean'}", "suffix=.bin", *more)
+    for more, changes in ((("voxel_size=0.8",), True), (("voxel_size=0.8",), False), (("voxel_size=0.4",), True)):
+        before = file.stat().st_mtime_ns if file.exists() else 0
+        assert cflow(*clean, *more) == 0 and "it is complete" in capsys.readouterr().out
+        assert (file.stat().st_mtime_ns != before) == changes, "another map is written, from the masks that are there"
+        assert (file.read_bytes() == older) == ("voxel_size=0.4" in more)
 
 
 def test_clean_clouds_of_an_earlier_flow_are_not_taken_for_complete(
@@ -206,8 +237,19 @@ def test_clean_clouds_of_an_earlier_flow_are_not_taken_for_complete(
     clean = ("clean", *data, f"output={tmp_path / 'clean'}", f"flow={tmp_path / 'flow'}")
     assert cflow(*flow) == 0 and cflow(*clean) == 0 and cflow(*clean) == 0
     assert "it is complete" in capsys.readouterr().out
+    few = "contents=[residual,cluster_id,score,is_valid]"
+    assert cflow(*flow, few, "overwrite=true") == 0 and cflow(*clean, "overwrite=true") == 1
+    assert "lacks confidence, moving: run `cflow flow` with all contents" in capsys.readouterr().err
     assert cflow(*flow, "model.significance=2", "overwrite=true") == 0
     assert cflow(*clean) != 0
     message = capsys.readouterr().err
     assert "flow_by.significance was 1.5, is 2.0" in message and "overwrite=true" in message
+    older = {file: file.read_bytes() for file in sorted((tmp_path / "clean" / "drive").rglob("*.npy"))}
+    for frame in (tmp_path / "flow").rglob("*.feather"):
+        frame.rename(frame.with_suffix(".away"))
+    assert cflow(*clean, "overwrite=true") == 1, "a run that fails leaves the older results"
+    assert "is missing: run `cflow flow` again" in capsys.readouterr().err
+    assert older == {file: file.read_bytes() for file in sorted((tmp_path / "clean" / "drive").rglob("*.npy"))}
+    for frame in (tmp_path / "flow").rglob("*.away"):
+        frame.rename(frame.with_suffix(".feather"))
     assert cflow(*clean, "overwrite=true") == 0

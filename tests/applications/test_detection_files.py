@@ -120,7 +120,7 @@ def test_openpcdet_reads_boxes_in_the_frame_of_the_points(tmp_path: Path) -> Non
     log = Staged([straight((0, -6), (0.8, 0.0))], np.tile(vehicle, (12, 1, 1)))
     table = track(log, log.results())
     table["class"] = np.where(table["sweep"] == 2, "cyclist", "car")
-    write_openpcdet(tmp_path / "result.pkl", table, log)
+    write_openpcdet(tmp_path, table, log)
     content = (tmp_path / "result.pkl").read_bytes()
     assert b"numpy.core.multiarray" in content and b"numpy._core" not in content, "NumPy 1 reads it"
     frames = pickle.loads(content)
@@ -137,7 +137,7 @@ def test_openpcdet_reads_boxes_in_the_frame_of_the_points(tmp_path: Path) -> Non
         np.testing.assert_allclose(box[3:6], SIZE, atol=0.01)
         assert box[6] == pytest.approx(-np.pi / 2, abs=0.02), "the car drives to the right of the vehicle"
     empty = {name: values[:0] for name, values in table.items()}
-    write_openpcdet(tmp_path / "result.pkl", empty, log)
+    write_openpcdet(tmp_path, empty, log)
     frames = pickle.loads((tmp_path / "result.pkl").read_bytes())
     assert frames[11]["boxes_lidar"].shape == (0, 7) and len(frames[11]["name"]) == 0
 

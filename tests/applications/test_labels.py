@@ -160,7 +160,9 @@ def test_ground_is_estimated_only_where_the_mask_is_missing(scenes: Path) -> Non
     assert found.dtype == np.bool_ and (found & truth).sum() / (found | truth).sum() > 0.9
 
 
-def test_existing_labels_are_replaced_only_with_overwrite(scenes: Path, tmp_path: Path, capsys: Any) -> None:
+def test_existing_labels_are_replaced_only_with_overwrite(
+    drives: Path, scenes: Path, tmp_path: Path, capsys: Any
+) -> None:
     file, output = scenes / "scene-2.h5", f"output={tmp_path / 'out'}"
     with h5py.File(file, "r+") as scene:
         for name in scene:
@@ -175,6 +177,10 @@ def test_existing_labels_are_replaced_only_with_overwrite(scenes: Path, tmp_path
     assert file.read_bytes() == before and not list(tmp_path.glob("out/*/*.feather"))
     assert label(scenes, output, "overwrite=true") == 0
     assert all(sweep["dufo"].dtype == np.uint8 and sweep["dufo"].max() == 1 for sweep in stored(file))
+    in_python = Path(shutil.copy(drives / "scene-2.h5", tmp_path))
+    label_scene(in_python, make_model(ONLINE, "cpu"))
+    for one, other in zip(stored(file), stored(in_python)):
+        assert all(np.array_equal(one[key], other[key]) for key in KEYS), "the command and Python have one rule"
     assert label(scenes, output, "model.significance=2") == 2
     assert "has labels of other settings" in capsys.readouterr().err
 

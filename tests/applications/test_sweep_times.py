@@ -112,8 +112,8 @@ def test_pairs_that_do_not_go_forward_in_time_are_an_error() -> None:
 def test_files_for_others_have_the_numbers_of_the_data_set(tmp_path: Path) -> None:
     log = Numbered([127, 128, 129, 130, 131, 135, 136, 137, 138, 139])
     table = track(log, log.results())
-    write_kitti(tmp_path / "kitti.txt", table, log)
-    write_openpcdet(tmp_path / "result.pkl", table, log)
+    write_kitti(tmp_path, table, log)
+    write_openpcdet(tmp_path, table, log)
     write_moving_labels(tmp_path / "labels", log, log.results())
     frames = [int(line.split()[0]) for line in (tmp_path / "kitti.txt").read_text().splitlines()]
     assert frames == [log.numbers[sweep] for sweep in table["sweep"]] and 136 in frames

@@ -174,13 +174,16 @@ def test_what_a_command_needs_is_checked_first(package, call, extra, tmp_path, m
 
 
 def test_a_second_eval_prints_its_tables(log_folder, tmp_path, cflow, capsys):
-    call = ("eval", *SMALL, log_folder, f"output={tmp_path / 'out'}")
+    log = shutil.copytree(log_folder, tmp_path / log_folder.name)
+    call = ("eval", *SMALL, log, f"output={tmp_path / 'out'}")
     texts = []
     for _ in range(2):
         assert cflow(*call) == 0
         texts.append(capsys.readouterr().out)
     assert "| **mean**" in texts[0] and "skipped, its results exist" in texts[1]
     assert texts[1].endswith(texts[0].partition("\n")[2])
+    next((log / "sensors" / "lidar").iterdir()).unlink()
+    assert cflow(*call) == 2 and "input_digest was" in capsys.readouterr().err, "the log has changed"
 
 
 def test_a_warning_is_shown_once(monkeypatch: Any, capsys: Any) -> None:

@@ -233,6 +233,14 @@ def test_a_folder_appears_complete_when_its_block_ends(tmp_path):
         (folder / "deep" / "a").write_bytes(b"new")
         assert not (tmp_path / "log").exists()
     assert (tmp_path / "log" / "deep" / "a").read_bytes() == b"new" and names(tmp_path) == ("log",)
+    with pytest.raises(CFlowError, match="exists already"), new_folder(tmp_path, "log"):
+        pass
+    with pytest.raises(KeyboardInterrupt), new_folder(tmp_path, "log", replace=True):
+        raise KeyboardInterrupt
+    assert (tmp_path / "log" / "deep" / "a").read_bytes() == b"new"
+    with new_folder(tmp_path, "log", replace=True):
+        pass
+    assert names(tmp_path) == ("log",) and names(tmp_path / "log") == ()
 
 
 def test_a_file_has_the_usual_mode_and_is_synced(tmp_path, monkeypatch):

@@ -63,5 +63,4 @@ def are_beyond(distance: float, config: VerifiedConfig) -> np.ndarray:
     size, (x0, y0) = config.pixel_sizes[-1], config.point_cloud_range[:2]
     height, width = bev_dims(config, size)
     y, x = np.arange(height) + (y0 / size + 0.5), np.arange(width) + (x0 / size + 0.5)
-    limit = np.sqrt(np.maximum(distance**2 - y[:, None] ** 2, 0))
-    return np.abs(x).astype(np.float32) > limit.astype(np.float32)
+    return y[:, None] ** 2 + x**2 > distance**2

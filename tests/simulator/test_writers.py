@@ -125,6 +125,7 @@ def test_a_drive_is_made_once(tmp_path, monkeypatch):
 def test_a_changed_generator_makes_new_drives(tmp_path, monkeypatch):
     shutil.copytree(benchmark._HERE, tmp_path / "code")
     key = benchmark.generator_key()
+    assert benchmark.generator_key(benchmark.HDF5) != key, "the code of its writer is of it, too"
     monkeypatch.setattr(benchmark, "_HERE", tmp_path / "code")
     assert benchmark.generator_key() == key
     file = tmp_path / "code" / "street.py"

@@ -67,6 +67,7 @@ def overhung(boxes: Sequence[Box]) -> tuple[int, torch.Tensor]:
         # At the border of the region.
         (((-2.0, 5.2, -1.7), (2.0, 6.8, 0.0)), [((-3.0, 4.6, 4.0), (3.0, 6.9, 6.0))], True),
         (high(-1.7, 4.2), [CROWN], False),  # it touches what is above
+        (high(26.0, 27.6), [high(30.0, 32.0), ((6.0, 4.0, -1.7), (8.0, 6.0, -0.5))], True),  # far above another object
         (high(-1.9, -1.5), [CROWN, high(0.0, 1.0)], True),  # one between is above it, so it is not copied
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from moving_scenes import Scene, from_images, moving_scene, one_object
 from oracle import registration as oracle
 
+from cflow_torch.ops import chunks
 from cflow_torch.ops.groups import Groups
 from cflow_torch.verified.changed_pixels import ChangedPixels
 from cflow_torch.verified.component_tree import find_components
@@ -18,6 +20,7 @@ from cflow_torch.verified.refinement import Registration, refine
 from cflow_torch.verified.rigid_motion import RigidMotion
 from cflow_torch.verified.selection import number_objects
 from cflow_torch.verified.slow_objects import find_slow
+from cflow_torch.verified.voxel_centroids import Voxels, covariance_of
 
 
 def registered(scene: Scene) -> RigidMotion:
@@ -42,6 +45,23 @@ def test_equals_the_oracle(snap, num_steps):
         found = assert_equals_oracle(scene)
         moved += int(((found.flow != scene.flow).any(1) & (found.rotation != 0)).sum())
     assert moved > 5
+
+
+@pytest.mark.parametrize("at_once", [9, 100, 1000])
+def test_chunks_do_not_change_a_bit(at_once, monkeypatch):
+    scene = moving_scene(range(5), 4, 0.1)
+    timed = replace(scene.points(), time=scene.points().position[0] / 10)
+
+    def results() -> tuple[torch.Tensor, ...]:
+        registration = Registration(timed, scene.sweeps, len(scene.flow))
+        motion = registration.align(scene.flow)
+        better = registration.improves(motion, torch.ones(len(scene.flow), dtype=torch.bool))
+        covariance = covariance_of(Voxels.of(timed, scene.sweeps))
+        return motion.flow, motion.rotation, registration.stretch(motion), better, covariance
+
+    expected = results()
+    monkeypatch.setattr(chunks, "CHUNK_ON_CPU", at_once)
+    assert all(map(torch.equal, results(), expected))
 
 
 def sides(angle: float, x: float, y: float) -> np.ndarray:

@@ -40,6 +40,16 @@ def spacing_of(clouds: list[np.ndarray], settings: VerifiedConfig = SETTINGS) ->
     return Spacing.of(make_batch(windows, settings, grid, torch.device("cpu"), 3), grid, SLICE_HEIGHT), grid
 
 
+def test_pixels_whose_middle_is_on_an_axis_have_the_reach_of_their_distance():
+    grid = Grid(0.1, (-55.25, -55.25, -3.0), (55.25, 55.25, 3.0))
+    angle = torch.tensor([math.radians(1.0)]).double()
+    spacing = Spacing(angle, angle, 6, True)
+    row_col = torch.stack((torch.full((1105,), 552 + 450), torch.arange(1105)))  # 45 m from the x axis
+    window = torch.zeros(1105, dtype=torch.int64)
+    assert spacing.reach(grid, window, row_col).unique().tolist() == [6]
+    assert spacing.are_tall(grid, window, row_col, SLICE_HEIGHT).all()
+
+
 def test_the_angle_is_that_between_beams_and_as_the_oracle_measures_it():
     clouds = [
         rings(1.2, 0),

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from scenes import assert_same_bits, flow_as_oracle
 
 from cflow_torch import Sweep, VerifiedFlow, Window
+from cflow_torch.verified import unlinked
 from cflow_torch.verified.component_tree import NodeKind
 from cflow_torch.verified.unlinked import link_unlinked
 
@@ -124,3 +128,19 @@ def test_windows_of_a_batch_do_not_meet():
     pair = Window(windows[0].pc0, windows[0].pc1)
     for result, one in zip(MODEL([*windows, pair]), [*windows, pair]):
         assert_same_bits(result, MODEL([one])[0])
+
+
+def test_the_cost_of_a_velocity_does_not_depend_on_sweeps_that_other_windows_have():
+    rng = torch.Generator().manual_seed(0)
+    error, moved = torch.rand((2, 200, 6), generator=rng, dtype=torch.float64)
+
+    def cost(num_steps: int) -> torch.Tensor:
+        is_given = (torch.arange(num_steps) < 6)[None]
+        sweeps: Any = SimpleNamespace(
+            is_given=is_given, grid=SimpleNamespace(pixel_size=0.1), has_history=torch.tensor([True])
+        )
+        more = (0, num_steps - 6)
+        window = torch.zeros(200, dtype=torch.int64)
+        return unlinked._judge(sweeps, window, F.pad(error, more), F.pad(moved, more))[1]
+
+    assert torch.equal(cost(9), cost(6)) and cost(6).isfinite().all()

@@ -31,7 +31,16 @@ STATIC, GROUND, UNKNOWN, FIRST = range(4)
 
 
 def content_of(html: str) -> dict[str, Any]:
-    return json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', html, re.DOTALL)[1])
+    """The JSON of a page, whose frames get the texts of their points as `data`."""
+    data = json.loads(script_of(html, "data"))
+    for index, frame in enumerate(data["frames"]):
+        assert "data" not in frame, "a browser cannot read one text of more than 512 MiB"
+        frame["data"] = script_of(html, f"points-{index}")
+    return data
+
+
+def script_of(html: str, name: str) -> str:
+    return re.search(rf'<script id="{name}"[^>]*>(.*?)</script>', html, re.DOTALL)[1]
 
 
 def points_of(data: dict[str, Any], frame: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -156,6 +165,8 @@ def test_a_name_in_the_data_cannot_run_as_a_script() -> None:
     html = show(window(Street(), 0), result_of(), title="</script><script>alert(1)</script>").html
     assert "alert(1)</script>" not in html and content_of(html)["title"].startswith("</script>")
     assert "[DATA]" not in html and "[K3D]" not in html
+    html = show(window(Street(), 0), result_of(), title="[DATA] [K3D]").html
+    assert content_of(html)["title"] == "[DATA] [K3D]" and "<title>[DATA] [K3D]</title>" in html
 
 
 # ---- in a browser ------------------------------------------------------------------------------------------------
@@ -471,6 +482,12 @@ def test_keys_stay_with_the_control_that_has_the_focus(browser: Any, drive_page:
         tab.locator(name).focus()
         tab.keyboard.press("Space")
         assert tab.evaluate(f"viewer.state.{value}") is not before and tab.evaluate("viewer.state.timer") is None
+    tab.locator("#slider").click()
+    assert tab.evaluate("document.activeElement.id") == "slider"
+    for key, expression in (("]", "viewer.state.pace === 2"), ("Space", "viewer.state.timer !== null")):
+        tab.keyboard.press(key)
+        assert tab.evaluate(expression), "a slider has no use for this key"
+    tab.keyboard.press("Space")
     camera = "viewer.K3D.getWorld().controls.getCameraArray()"
     start = tab.evaluate(camera)
     tab.locator("#coloring").focus()
@@ -482,20 +499,28 @@ def test_keys_stay_with_the_control_that_has_the_focus(browser: Any, drive_page:
     tab.close()
 
 
-def test_a_page_of_every_fifth_pair_plays_at_the_pace_of_the_drive(
+def test_a_page_of_every_fifth_pair_has_the_pace_of_the_drive_and_the_sweep_of_its_address(
     browser: Any, drive_page: Path, tmp_path: Path
 ) -> None:
+    """The page of every fifth pair lacks an object in its first sweep."""
     text = drive_page.read_text(encoding="utf-8")
-    data = content_of(text)
+    script = script_of(text, "data")
+    data = json.loads(script)
     for frame in data["frames"]:
         frame["sweep"] *= 5
-    script = re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.DOTALL)
-    (tmp_path / "page.html").write_text(text.replace(script[1], json.dumps(data)), encoding="utf-8")
+    ids = [{box["id"] for box in frame["boxes"]} for frame in data["frames"]]
+    late = min(ids[0] & ids[1])
+    data["frames"][0]["boxes"] = [box for box in data["frames"][0]["boxes"] if box["id"] != late]
+    (tmp_path / "page.html").write_text(text.replace(script, json.dumps(data)), encoding="utf-8")
     tab = browser.new_page()
     pauses = []
-    for page in (drive_page, tmp_path / "page.html"):
-        tab.goto(page.as_uri())
+    for address in (drive_page.as_uri(), f"{(tmp_path / 'page.html').as_uri()}#sweep=0&object={late}"):
+        tab.goto(address)
         tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
         pauses.append(tab.evaluate("viewer.pause()"))
     assert pauses == pytest.approx([0.1, 0.5])
+    assert tab.evaluate("[viewer.state.frame, viewer.state.chosen]") == [0, late]
+    assert "not seen in this sweep" in tab.locator("#object").inner_text()
+    tab.evaluate(f"location.hash = '#object={late}'")
+    tab.wait_for_function("viewer.state.frame === 1")
     tab.close()

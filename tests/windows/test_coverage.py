@@ -10,8 +10,11 @@ from scenes import assert_same_bits, sweeps_of
 from cflow_torch import VerifiedFlow
 from cflow_torch.config import VerifiedConfig
 from cflow_torch.evaluation.frame import ego_motion_flow
+from cflow_torch.ops.groups import Groups
 from cflow_torch.simulator import Drive, make_drive
 from cflow_torch.types import Sweep, Window
+from cflow_torch.verified.comparisons import count_in_place
+from cflow_torch.verified.paired_test import count_wins
 from cflow_torch.windows.coverage import Coverage
 
 NUM_BINS = 182  # two of them are the y axis
@@ -70,23 +73,70 @@ def test_equals_plain_loops_for_sweeps_alone_and_together():
     assert sum(flags[0]) > 100 and sum(flags[1]) == 0 and sum(flags[2]) > 100
 
 
+REGION = (-9.0, -9.0, -3.0, 9.0, 9.0, 3.0)
+DEGREES = np.arange(0, 360, 0.5)
+ANGLE = np.radians(DEGREES)
+RING = np.stack((5 * np.cos(ANGLE), 5 * np.sin(ANGLE), np.full_like(ANGLE, -1.6)), 1).astype(np.float32)  # the ground
+IS_LEFT = (DEGREES > 10) & (DEGREES < 80)
+
+
+def block(low: tuple[float, float, float], seed: int = 0) -> np.ndarray:
+    """Points of a block with a side of a metre."""
+    return np.random.default_rng(seed).uniform(low, np.add(low, 1), (60, 3)).astype(np.float32)
+
+
+def on_ring(*blocks: np.ndarray) -> Sweep:
+    """A sweep of blocks on the ground."""
+    points = np.concatenate((RING, *blocks))
+    return Sweep(points, is_ground=np.arange(len(points)) < len(RING))
+
+
 def test_copies_are_filled_where_a_sweep_did_not_measure():
     """Windows of a block ahead to the left at t: in the second one, t+1 did not measure there."""
-    angle = np.radians(np.arange(0, 360, 0.5))
-    ring = np.stack((5 * np.cos(angle), 5 * np.sin(angle), np.full_like(angle, -1.6)), 1).astype(np.float32)
-    block = np.random.default_rng(0).uniform((2, 2, 0), (3, 3, 1), (60, 3)).astype(np.float32)
-    at_t = Sweep(np.concatenate((ring, block)), is_ground=np.arange(len(ring) + len(block)) < len(ring))
-    is_left = (angle > np.radians(10)) & (angle < np.radians(80))
-    whole, partial = (Sweep(points, is_ground=np.ones(len(points), bool)) for points in (ring, ring[~is_left]))
-    region = (-9.0, -9.0, -3.0, 9.0, 9.0, 3.0)
-    settings = VerifiedConfig(pixel_sizes=(0.25,), point_cloud_range=region)
+    at_t = on_ring(block((2, 2, 0)))
+    whole, partial = (Sweep(points, is_ground=np.ones(len(points), bool)) for points in (RING, RING[~IS_LEFT]))
+    settings = VerifiedConfig(pixel_sizes=(0.25,), point_cloud_range=REGION)
     sweeps = sweeps_of([Window(at_t, whole), Window(at_t, partial)], settings)
     rows = sweeps.points.is_member.nonzero()[:, 0]
     copied = sweeps.with_copies(rows)
     copies = copied.pixels[torch.arange(sweeps.num_pixels, copied.num_pixels)]
-    assert len(rows) == 2 * len(block) and len(copies) == sweeps.num_pixels
+    assert len(rows) == 2 * 60 and len(copies) == sweeps.num_pixels
     assert torch.equal(copied.columns.are_filled(copies, 0), copies.window == 3)
     assert torch.equal(copied.columns.look_up(copies, 0), sweeps.columns.look_up(sweeps.pixels, 0))
+
+
+def test_what_was_not_measured_is_evidence_neither_for_a_motion_nor_against_it():
+    """Two blocks at t. Sweep t+1 did not measure the place of the second: there, nothing arrives, and nothing stays."""
+    two = on_ring(block((2, -1.5, 0)), block((2, 2, 0)))
+    partial = Sweep(RING[~IS_LEFT], is_ground=np.ones((~IS_LEFT).sum(), bool))
+    settings = VerifiedConfig(pixel_sizes=(0.25,), point_cloud_range=REGION)
+    sweeps = sweeps_of([Window(two, partial)], settings)
+    blocks = Groups((sweeps.pixels.row_col[0] > 36 + 4).long(), 2)  # the middle is row 36
+    motions = torch.tensor([[[14.0, 0.0]], [[-14.0, 0.0]]], dtype=torch.float64)  # 3.5 m
+    exact, near = count_wins(sweeps, sweeps.pixels, blocks, motions)
+    assert not torch.stack((*exact, *near)).any()
+    in_place = count_in_place(sweeps, sweeps.pixels, blocks)
+    assert in_place.compared[0] > 20 and in_place.compared[1] == 0 and in_place.found.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("step", [1.5, 2.5])
+def test_a_car_moves_whose_place_older_sweeps_did_not_measure(step):
+    """A car on an empty road. Sweeps before t lack a third of the circle, in which the car is."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-40, 40, (2, 20000))
+    ground = np.stack((x, y, rng.normal(-1.7, 0.01, 20000)), 1)
+    sweeps = []
+    for age in range(6):
+        car = (-2 - age * step, 12.0, -1.4) + rng.uniform(0, 1, (400, 3)) * (4.2, 1.8, 1.4)
+        points = np.concatenate((ground, car)).astype(np.float32)
+        azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+        kept = (azimuth < 30) | (azimuth > 150) | (age < 2)
+        is_ground = np.arange(len(points)) < len(ground)
+        sweeps.append(Sweep(points[kept], is_ground=is_ground[kept], pose=np.eye(4)))
+    newest, now, *history = sweeps
+    (result,) = VerifiedFlow.from_preset("default")([Window(now, newest, pch=tuple(history))])
+    error = (result.residual_flow[-400:] - torch.tensor([step, 0, 0])).norm(dim=1)
+    assert error.max() < 0.15 and not result.residual_flow[:-400].any()
 
 
 def cut(sweep: Sweep, is_front: bool, is_lost: bool) -> np.ndarray:

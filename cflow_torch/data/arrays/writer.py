@@ -10,8 +10,10 @@ import numpy as np
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, in_single, write_cloud
 from cflow_torch.data.arrays.folder import GROUND_FOLDER
 from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times
+from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.log import Log
+from cflow_torch.data.paths import stem_of
 from cflow_torch.transforms import to_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
@@ -44,9 +46,10 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", viewpoint:
         The folder.
 
     Convention:
-        The folder appears complete or not at all. Points are in the log's ego frame, poses `T_world_ego` with 12
-        numbers per line (KITTI). We write poses, times and masks if every sweep has them, and the other columns of each
-        cloud.
+        The folder appears complete or not at all. Clouds have the numbers of their sweeps in the data set
+        (`Log.frame_number`), so missing sweeps stay missing; those of a folder of clouds keep their names. Points are
+        in the log's ego frame, poses `T_world_ego` with 12 numbers per line (KITTI). We write poses, times and masks if
+        every sweep has them, and the other columns of each cloud.
 
     Raises:
         CFlowError: an unknown suffix, poses of only some sweeps, or the folder exists; a `viewpoint` without poses, or
@@ -60,10 +63,17 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", viewpoint:
     with new_folder(root, log.log_id) as folder:
         for index in range(len(log.timestamps)):
             sweep = log.sweep(index)
-            write_sweep(folder / POINTS_FOLDER / f"{index:06d}{suffix}", log, index, sweep, viewpoint)
-            sides[f"{index:06d}"] = SweepSides.of(sweep)
+            name = cloud_name(log, index)
+            write_sweep(folder / POINTS_FOLDER / f"{name}{suffix}", log, index, sweep, viewpoint)
+            sides[name] = SweepSides.of(sweep)
         write_sides(folder, log.log_id, sides, has_viewpoints=viewpoint is not None)
     return Path(root) / log.log_id
+
+
+def cloud_name(log: Log, index: int) -> str:
+    """Return the name of the cloud of sweep `index` without a suffix: that of its file, or its number."""
+    own = log.unwrapped
+    return stem_of(own.files[index]) if isinstance(own, ArraysLog) else f"{log.frame_number(index):06d}"
 
 
 def write_sweep(file: Path, log: Log, index: int, sweep: Sweep, viewpoint: str | None) -> None:

@@ -40,6 +40,11 @@ _writing = partial(file_errors, hint="pass a complete scene, and free space for 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 
 
+def write_hdf5_log(log: Log, root: Path) -> None:
+    """Write a log as the scene `root/<log_id>.h5`, see `write_hdf5_scene`."""
+    write_hdf5_scene(log, root / f"{log.log_id}.h5")
+
+
 def write_hdf5_scene(log: Log, file: str | Path, eval_step: int = 5) -> None:
     """Write a log as one scene in the ego frame: one group per sweep, named by its time stamp.
 
