@@ -14,6 +14,7 @@ from cflow_torch.data.boxes import Boxes, BoxLog, category_indices
 from cflow_torch.data.camera import Camera, at_image, intrinsic_matrix
 from cflow_torch.data.categories import CATEGORIES
 from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.folders import visible
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.npy_file import read_npy
@@ -66,7 +67,7 @@ class GroundRaster(NamedTuple):
 def read_ground_raster(map_folder: Path) -> GroundRaster | None:
     """Read the ground raster in the folder `map` of a log; None = it has none. More than one is a `CFlowError`."""
     names = ("*_ground_height_surface____*.npy", "*___img_Sim2_city.json")
-    rasters, alignments = (sorted(map_folder.glob(name)) for name in names)
+    rasters, alignments = ([path for path in sorted(visible(map_folder)) if path.match(name)] for name in names)
     if not rasters:
         return None
     if len(rasters) > 1 or len(alignments) != 1:

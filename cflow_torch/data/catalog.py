@@ -161,6 +161,7 @@ _CONVERSIONS = {
     ),
     **dict.fromkeys((".pcap", ".pcapng"), "convert the packets with the tool of the sensor's maker to .pcd or a bag"),
     **dict.fromkeys((".e57", ".drc", ".rcp"), "convert them to .ply"),
+    ".zstd": "unpack them (zstd -d); they are bags of ros2 bag record --compression-mode file",
     **dict.fromkeys((".gz", ".zip", ".tar", ".tgz", ".7z", ".zst", ".bz2"), "unpack them"),
     **dict.fromkeys((".pt", ".pth", ".pkl", ".mat"), "convert the cloud of each sweep with numpy.save"),
     **dict.fromkeys((".hdf5", ".hdf", ".he5"), "if they are scenes of OpenSceneFlow, rename them to .h5"),
@@ -181,6 +182,7 @@ def _why_nothing_fits(top: Path) -> str:
         return "it has no files that you may read" if top.is_dir() else ""
     suffix, count = suffixes.most_common(1)[0]
     clouds = [kind for kind in suffixes if kind in SUFFIXES] or [kind for kind in suffixes if kind in TEXTS]
+    clouds = [] if suffix in _CONVERSIONS and suffix not in TEXTS else clouds
     if clouds and all(suffixes[kind] == 1 for kind in clouds):
         return f"it has one file of points ({clouds[0]}); scene flow needs a file for each of two sweeps or more"
     if clouds and clouds[0] in SUFFIXES:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from typing import Iterable, Sequence
 
+import numpy as np
+
 AXES = ("x", "y", "z")
 # Names without punctuation and units, as drivers, odometry programs and exports of ROS messages write them.
 _ROTATION = "(q|.*quat|.*quaternion|.*orientation|.*rot|.*rotation|.*heading|qrs)"
@@ -25,7 +27,8 @@ _ROLES = {
     "yaw": ".*(yaw|heading|theta)(deg|degrees|rad|radians)?",
 }
 _TIME_OF_POINT = "((d|delta)?t|.*time|.*stamp|(t|.*time|.*stamp)?offset)(s|secs?|nsecs?|ns|us|ms|unix)?"
-_OTHERS = "twist|linear|angular|veloc|accel|covariance|rate"
+_FEWEST_COUNTED = 20  # rows of a column that surely counts them
+_OTHERS = "normal|twist|linear|angular|veloc|accel|covariance|rate"
 
 
 def distinct_names(names: Sequence[str], padding: str = "") -> list[str]:
@@ -37,6 +40,28 @@ def distinct_names(names: Sequence[str], padding: str = "") -> list[str]:
 def default_names(count: int) -> list[str]:
     """Return the names of columns without names: x, y, z, column_3, ..."""
     return [*AXES, *(f"column_{k}" for k in range(3, count))]
+
+
+def with_axes(names: Sequence[str]) -> list[str]:
+    """Return distinct names, of which those of a position are x, y and z: also lidar_x, lidar_y, lidar_z."""
+    if set(AXES) <= set(names):
+        return distinct_names(names)
+    roles = [role_of_name(name) for name in names]
+    plain = [re.sub(r"[\W_]", "", name.lower()) for name in names]
+    ends = [name[:-1] for name in plain if name.endswith("x") and not re.search(_OTHERS, name)]
+    alike = next((start for start in ends if {start + axis for axis in AXES} <= set(plain)), None)
+    if not set(AXES) <= set(roles) and alike is not None:
+        roles = [name[-1] if name[:-1] == alike else None for name in plain]
+    return distinct_names(
+        [str(role) if role in AXES and roles.index(role) == k else names[k] for k, role in enumerate(roles)]
+    )
+
+
+def first_coordinate(columns: Sequence[np.ndarray]) -> int:
+    """Return the index of the column of x among columns without names: 1 if the first one counts the rows, else 0."""
+    counter = columns[0]
+    is_counter = len(columns) > len(AXES) and len(counter) >= _FEWEST_COUNTED and counter[0] in (0, 1)
+    return int(is_counter and np.array_equal(counter, np.arange(len(counter)) + counter[0]))
 
 
 def role_of_name(name: str) -> str | None:

@@ -7,10 +7,12 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, Callable, Sequence, TypeVar
 
-from cflow_torch.data.paths import is_remote
+from cflow_torch.data.paths import is_remote, read_bytes
 from cflow_torch.errors import CFlowError
 
 _T = TypeVar("_T")
+_OF_FLOW, _OF_CLEAN = "manifest.json", "clean.json"  # records in folders of results; the second are logs, too
+_OURS = b'"cflow_torch"'  # what a record of ours contains
 
 
 def search(
@@ -22,25 +24,36 @@ def search(
 ) -> list[_T]:
     """Collect what `find` returns for `root` and the folders at most `depth` levels below it, by levels.
 
-    We do not search below folders in which something is found, in hidden folders, or in folders for which `is_passed`
-    is False. A root that is not a folder is a `CFlowError`, which says `what` to pass.
+    We do not search below folders in which something is found, in hidden folders, in folders of flow that we computed,
+    or in folders for which `is_passed` is False. Clean logs that we wrote count only if there are no others. A root
+    that is not a folder is a `CFlowError`, which says `what` to pass.
     """
     if not root.is_dir():
         raise CFlowError(f"{root} is not a folder; pass {what}")
     found: list[_T] = []
+    clean: list[_T] = []
     level = [root]
     for _ in range(depth + 1):
-        children_of = {folder: visible(folder) for folder in level}
-        here = [(children, find(folder)) for folder, children in children_of.items() if children]
-        found += [each for _, all_found in here for each in all_found]
-        children = [child for children, all_found in here if not all_found for child in children]
+        children: list[Path] = []
+        for folder in level:
+            inside = visible(folder)
+            record = "" if folder == root else record_in(inside)
+            here = find(folder) if inside and record != _OF_FLOW else []
+            (clean if record else found).extend(here)
+            children += [] if here or record else inside
         level = [child for child in children if is_passed(child) and child.is_dir()]
-    return found
+    return found or clean
 
 
 def find_folders(root: Path, is_log: Callable[[Path], bool], depth: int, what: str, **settings: Any) -> list[Path]:
     """Find the folders that are logs, sorted, see `search`."""
     return sorted(search(root, lambda folder: [folder] if is_log(folder) else [], depth, what, **settings))
+
+
+def record_in(files: Sequence[Path]) -> str:
+    """Return the name of the record among the files of a folder of results that we wrote; "" = it is none of ours."""
+    records = [path for path in files if path.name in (_OF_FLOW, _OF_CLEAN)]
+    return next((path.name for path in records if _OURS in read_bytes(path)), "")
 
 
 def visible(folder: Path) -> list[Path]:

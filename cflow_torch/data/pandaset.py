@@ -13,6 +13,7 @@ from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes
 from cflow_torch.data.camera import Camera, intrinsic_matrix
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.file_errors import check_columns, file_errors
+from cflow_torch.data.folders import visible
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, exist, read_bytes, remote_errors
@@ -69,7 +70,8 @@ class PandaSetLog(Log):
         self.folder = as_path(folder)
         self.log_id = self.folder.resolve().name
         lidar = self.folder / "lidar"
-        self._files = sorted(lidar.glob("*.pkl.gz")) or sorted(lidar.glob("*.pkl"))
+        named = {end: sorted(path for path in visible(lidar) if path.name.endswith(end)) for end in (".pkl.gz", ".pkl")}
+        self._files = named[".pkl.gz"] or named[".pkl"]
         times, poses = lidar / "timestamps.json", lidar / "poses.json"
         with file_errors(times):
             self.timestamps = [round(float(seconds) * 1e9) for seconds in read_json(times)]

@@ -24,6 +24,7 @@ from cflow_torch.data.arrays.writer import write_array_log
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.log import Log
 from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
+from cflow_torch.types import CFlowWarning
 
 STAMP = 1_700_000_000_123_456_789
 
@@ -246,6 +247,25 @@ def test_columns_are_found_by_name_or_position(tmp_path):
         assert np.array_equal(read_cloud(file, 5), points), file.name
 
 
+def test_a_column_that_counts_the_rows_is_no_coordinate(tmp_path):
+    """As pandas writes it; the check called such points centimetres. Names may begin alike: lidar_x, lidar_y, ..."""
+    points = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
+    counted = np.column_stack([np.arange(30), points])
+    np.savetxt(tmp_path / "plain.csv", counted, "%.9g", delimiter=",")
+    (tmp_path / "pandas.csv").write_text(",0,1,2\n" + (tmp_path / "plain.csv").read_text())
+    np.savetxt(tmp_path / "from_1.xyz", counted + (1, 0, 0, 0), "%.9g")
+    np.save(tmp_path / "plain.npy", counted)
+    columns = {"index": counted[:, 0], **{f"lidar_{axis}": points[:, k] for k, axis in enumerate("xyz")}}
+    feather.write_feather(pa.table(columns), str(tmp_path / "named.feather"))
+    feather.write_feather(pa.table(dict(zip("abcd", columns.values()))), str(tmp_path / "other.feather"))
+    normals = {f"normal_{axis}": points[:, 0] for axis in "xyz"}
+    feather.write_feather(pa.table({**normals, **columns}), str(tmp_path / "normals.feather"))
+    for file in sorted(tmp_path.iterdir()):
+        assert np.array_equal(read_cloud(file).astype(np.float32), points), file.name
+    np.save(tmp_path / "xyz.npy", counted[:, :3])
+    assert np.array_equal(read_cloud(tmp_path / "xyz.npy"), counted[:, :3]), "three columns are x, y, z"
+
+
 @pytest.mark.parametrize("kind", ["i2", "i4", "i8"])
 def test_integers_are_millimetres_or_centimetres_and_keep_their_digits(tmp_path, kind):
     points = np.array([[12345, -20000, 300], [1, 2, 3], [32767, 0, -32768]], kind)
@@ -284,6 +304,24 @@ def test_clouds_of_two_sensors_in_one_folder_need_a_choice(tmp_path):
     np.save(tmp_path / "front_2.npy", np.full((3, 3), 9.0))
     with pytest.raises(CFlowError, match=r"front_\*\.npy, rear_\*\.npy: choose one by suffix"):
         ArraysLog(tmp_path)
+
+
+@pytest.mark.parametrize("names", [("os0_{:03d}", "os1_{:03d}"), ("lidar0_17{:08d}00", "lidar1_17{:08d}30")])
+def test_sensors_may_differ_by_a_digit(tmp_path, names):
+    for name in names:
+        for number in range(3):
+            np.save(tmp_path / f"{name.format(number)}.npy", np.ones((4, 3)))
+    with pytest.raises(CFlowError, match=r"several kinds of clouds, \w+0_\*.npy, \w+1_\*.npy: choose one"):
+        ArraysLog(tmp_path)
+    assert len(ArraysLog(tmp_path, suffix=names[1].split("_")[0] + "_*.npy")) == 3
+
+
+def test_numbers_that_count_tell_no_sensors(tmp_path):
+    for name in ("drive1_a", "20240105T12_00", "20240105T13_00", "scan1", "scan10_x2"):
+        (tmp_path / name).mkdir()
+        for number in range(3):
+            np.save(tmp_path / name / f"{name}{number}.npy", np.ones((4, 3)))
+        assert len(ArraysLog(tmp_path / name)) == 3
 
 
 def test_files_with_other_contents_are_refused(tmp_path):
@@ -426,6 +464,11 @@ def test_kitti_camera_poses_become_lidar_poses(tmp_path, folder):
     (folder / "calib.txt").write_text(f"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: {row}\n")
     assert np.abs(ArraysLog(folder).poses - lidar).max() < 1e-12
     assert np.abs(ArraysLog(folder, calibration=None).poses[1] - lidar[1]).max() > 0.5
+    kitti = (folder / "calib.txt").read_text()
+    (folder / "calib.txt").write_text("fx 700\nP0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    with pytest.warns(CFlowWarning, match="calib.txt has no Tr, so we take the poses for those of the LiDAR"):
+        assert np.array_equal(ArraysLog(folder).poses, ArraysLog(folder, calibration=None).poses)
+    (folder / "calib.txt").write_text(kitti)
     tree = tmp_path / "kitti" / "sequences" / "00"  # dataset/sequences/00/velodyne and dataset/poses/00.txt
     tree.mkdir(parents=True)
     (folder / "points").rename(tree / "velodyne")

@@ -117,6 +117,8 @@ def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Pat
         (["a.gz"], r"its 1 \.gz files are not read: unpack them"),
         (["a.las", "b.laz", "c.las"], "its 2 .las files are not read: convert them with pdal"),
         (["a/1.xyz", "a/2.xyz"], "its 2 .xyz files are not read"),
+        (["a.las", "b.las", "poses.txt"], "its 2 .las files are not read"),
+        (["drive_0.db3.zstd"], r"its 1 \.zstd files are not read: unpack them"),
         (["a/1.xyz"], r"it has one file of points \(.xyz\); .* a file for each of two sweeps"),
         (["1.pcd"], "it has one file of points"),
         (["0/points.ply", "1/points.ply"], "its 2 .ply files lie alone in their folders: put those of a log into one"),
@@ -177,6 +179,34 @@ def test_the_name_open_does_not_hide_that_of_python() -> None:
     names: dict[str, Any] = {}
     exec("from cflow_torch import *", names)
     assert "open" not in names and "estimate_flow" in names and "open" in dir(cflow_torch)
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [("hdf5", "scene.h5"), ("hdf5", "train/scene.h5"), ("waymo", "lidar/a.parquet"), ("bags", "drive.bag")],
+)
+def test_hidden_files_are_no_logs(name: str, file: str, tmp_path: Path) -> None:
+    """macOS puts a file ._NAME next to each file."""
+    path = tmp_path / file
+    path.parent.mkdir(exist_ok=True)
+    for each in (path, path.with_name(f"._{path.name}")):
+        each.write_bytes(b"")
+    assert find_sources(name, tmp_path) == [path]
+
+
+def test_results_in_the_folder_of_the_data_are_no_input(tmp_path: Path) -> None:
+    """Else flow was computed of flow, and the first log got another name, so a run was not resumed."""
+    for place in ("drive/points", "flow/drive", "clean/drive/points"):
+        (tmp_path / place).mkdir(parents=True)
+        for number in range(2):
+            np.save(tmp_path / place / f"{number}.npy", np.ones((5, 3)))
+    record = json.dumps({"run": {"versions": {"cflow_torch": "1"}}})
+    (tmp_path / "flow" / "drive" / "manifest.json").write_text(record)
+    (tmp_path / "clean" / "drive" / "clean.json").write_text(record)
+    assert find_sources("arrays", tmp_path) == [tmp_path / "drive"]
+    assert find_sources("arrays", tmp_path / "clean") == [tmp_path / "clean" / "drive"], "a clean log alone is one"
+    (tmp_path / "flow" / "drive" / "manifest.json").write_text("{}")
+    assert len(find_sources("arrays", tmp_path)) == 2, "a file of that name of others means nothing"
 
 
 def test_logs_of_one_name_are_told_apart(tmp_path: Path) -> None:

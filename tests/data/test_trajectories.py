@@ -168,6 +168,14 @@ def test_names_are_milliseconds() -> None:
     assert times_of_names(["1700000000123", "1700000000223"]) == [1_700_000_000_123_000_000, 1_700_000_000_223_000_000]
 
 
+@pytest.mark.parametrize("fraction", ["{}", ".{}", "{}000", "_{}"])
+def test_names_are_dates_without_separators(fraction: str) -> None:
+    """A number of 17 digits was taken for microseconds, which an int64 of nanoseconds cannot hold."""
+    names = [f"20231114221{320 + k // 10}" + fraction.format(f"{k % 10}00") for k in range(24)]
+    assert times_of_names(names) == [1_700_000_000_000_000_000 + k * 100_000_000 for k in range(24)]
+    assert times_of_names(["99999999999999997", "99999999999999998"]) is None
+
+
 @pytest.mark.parametrize("first", ["000001", "frame1", "000_001", "2024_01_05", "0000000000001", "0000000000000000001"])
 def test_other_names_are_no_times(first: str) -> None:
     assert times_of_names([first, first[:-1] + "2"]) is None and times_of_names(["1.5", "a"]) is None
@@ -283,6 +291,25 @@ def test_three_numbers_are_a_plane_pose_if_the_vehicle_drives_where_it_heads(tmp
         path.write_text(positions)
         with pytest.raises(CFlowError, match="3 numbers per line"):
             poses_text.read_poses(path)
+
+
+def test_a_yaw_that_is_not_wrapped_has_radians(tmp_path) -> None:
+    yaw = np.arange(60) * 0.2  # almost two turns
+    way = np.cumsum(np.exp(1j * yaw))
+    for unit in (1.0, 180 / np.pi):
+        lines = rows(np.column_stack([way.real, way.imag, 0 * yaw, 0 * yaw, 0 * yaw, yaw * unit])[:-1])
+        (tmp_path / "poses.txt").write_text("\n".join(lines))
+        turned = poses_text.read_poses(tmp_path / "poses.txt").poses[1:, 0, 0]
+        assert np.allclose(turned, np.cos(yaw[1:-1]), atol=1e-6), unit
+
+
+def test_a_number_may_be_in_front_of_tum(tmp_path) -> None:
+    (tmp_path / "poses.txt").write_text("\n".join(f"{k} {each}" for k, each in enumerate(EXACT)))
+    read = poses_text.read_poses(tmp_path / "poses.txt")
+    assert read.times_ns.tolist() == STAMPS and np.allclose(read.poses[:, 0, 3], range(12), atol=1e-5)
+    (tmp_path / "poses.txt").write_text("\n".join(f"{k % 3} {each}" for k, each in enumerate(EXACT)))
+    with pytest.raises(CFlowError, match="9 numbers per line"):
+        poses_text.read_poses(tmp_path / "poses.txt")
 
 
 def test_places_on_the_globe_become_metres(tmp_path) -> None:
@@ -846,6 +873,60 @@ def test_clouds_of_a_second_sensor_are_said(tmp_path) -> None:
     (tmp_path / "poses.txt").write_text("\n".join(EXACT))
     with pytest.warns(CFlowWarning, match="we read the clouds in front; there are others in rear"):
         ArraysLog(tmp_path)
+
+
+def test_labels_and_maps_next_to_clouds_are_not_the_clouds(tmp_path) -> None:
+    for name in ("a_labels", "sweeps", "boxes"):
+        clouds(tmp_path / name)
+    for file in (tmp_path / "a_labels").iterdir():
+        np.save(file, np.zeros(5, np.int32))
+    for file in (tmp_path / "sweeps").iterdir():
+        np.save(file, np.ones((500, 3)))
+    for name in ("global", "surface"):
+        np.save(tmp_path / f"{name}.npy", np.ones((2000, 3)))
+    (tmp_path / "poses.txt").write_text("\n".join(EXACT))
+    assert find_array_logs(tmp_path) == [tmp_path]
+    with pytest.warns(CFlowWarning, match="we read the clouds in sweeps; there are others in boxes$"):
+        log: Any = ArraysLog(tmp_path)
+    assert len(log) == len(log.poses) == 12 and {file.parent.name for file in log.files} == {"sweeps"}
+
+
+POSES_NEAR = {
+    "lidar/pcd": "poses.txt",
+    "lidar/top": "poses.txt",
+    "clouds_of_os1": "poses/poses.txt",
+    "one": "poses_one.txt",
+    "two": "ground_truth/two.txt",
+}
+
+
+@pytest.mark.parametrize("below", POSES_NEAR)
+def test_poses_of_as_many_sweeps_are_found_near_a_folder(tmp_path, below) -> None:
+    """Without times, the name of the file or of its folder must say that these are poses."""
+    folder = clouds(tmp_path / "drive" / below, range(12))
+    file = tmp_path / "drive" / POSES_NEAR[below]
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("\n".join(rows(POSES[:, :3].reshape(12, 12))))
+    file.with_name("poses_other.txt").write_text("\n".join(rows(POSES[:9, :3].reshape(9, 12))))  # of another length
+    (tmp_path / "drive" / "numbers.txt").write_text(file.read_text())
+    assert np.allclose(ArraysLog(folder).poses, POSES)
+
+
+def test_a_calibration_of_a_few_matrices_is_no_trajectory(tmp_path) -> None:
+    clouds(tmp_path, range(12))
+    (tmp_path / "calib").mkdir()
+    for name in ("camera", "radar", "imu"):
+        np.savetxt(tmp_path / "calib" / f"{name}.txt", np.eye(4))
+    assert ArraysLog(tmp_path).poses is None
+
+
+def test_of_two_trajectories_that_of_the_times_of_the_sweeps_is_used(tmp_path) -> None:
+    clouds(tmp_path)
+    (tmp_path / "Ouster_gt.txt").write_text("\n".join(EXACT))
+    other = [line(k, seconds(stamp + 30_000_000)) for k, stamp in enumerate(STAMPS)]
+    (tmp_path / "Velodyne_gt.txt").write_text("\n".join([line(0, seconds(STAMPS[0] - 10**8)), *other]))
+    with pytest.warns(CFlowWarning, match="its poses are those of Ouster_gt.txt"):
+        assert ArraysLog(tmp_path).poses[:, 0, 3].tolist() == list(range(12))
 
 
 def test_a_gap_in_the_times_splits_a_folder(tmp_path) -> None:

@@ -17,7 +17,7 @@ from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS, BinLayout, find_bi
 from cflow_torch.data.arrays.pcd import pcd_fields, pcd_viewpoint, pypcd4
 from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.column_names import AXES, default_names
+from cflow_torch.data.column_names import AXES, default_names, first_coordinate, with_axes
 from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.paths import PathLike, as_path, read_bytes, suffix_of
 from cflow_torch.tensors import resolution
@@ -283,7 +283,9 @@ def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:
         return {name: array[name] for name in array.dtype.names}
     if array.ndim != 2 or array.shape[1] < 3 or array.shape[1] > max(_MOST_COLUMNS, len(array)):
         raise CFlowError(f"it has an array of shape {array.shape}; it must be (N, 3+), columns x, y, z first")
-    return dict(zip(default_names(array.shape[1]), array.T))
+    columns = list(array.T)
+    columns = columns[first_coordinate(columns) :]
+    return dict(zip(default_names(len(columns)), columns))
 
 
 def _by_rows(array: np.ndarray) -> np.ndarray:
@@ -325,8 +327,11 @@ def _archive_columns(content: bytes) -> dict[str, np.ndarray]:
 def _table_columns(read: Any, content: bytes) -> dict[str, np.ndarray]:
     table = read(pa.BufferReader(content), use_threads=False)
     table.validate(full=True)
-    if not set(AXES) <= set(table.column_names):
-        table = table.rename_columns([*AXES, *table.column_names[3:]][: table.num_columns])
+    names = with_axes(table.column_names)
+    if not set(AXES) <= set(names):
+        begin = first_coordinate([column.to_numpy() for column in table.columns])
+        names = [*names[:begin], *AXES, *names[begin + 3 :]][: table.num_columns]
+    table = table.rename_columns(names)
     if any(table.column(axis).null_count for axis in AXES if axis in table.column_names):
         raise CFlowError("x, y, z must not have empty entries")
     kinds = (pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean)

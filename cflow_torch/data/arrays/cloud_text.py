@@ -9,7 +9,7 @@ import pyarrow as pa
 from pyarrow import csv
 
 from cflow_torch.data.arrays.tables import split_line, start_of_rows
-from cflow_torch.data.column_names import AXES, default_names, distinct_names, role_of_name
+from cflow_torch.data.column_names import AXES, default_names, first_coordinate, with_axes
 from cflow_torch.types import CFlowError
 
 SUFFIXES = (".csv", ".txt", ".xyz", ".pts", ".asc")
@@ -41,13 +41,14 @@ def text_columns(content: bytes) -> dict[str, np.ndarray]:
     }
     table = csv.read_csv(pa.BufferReader(content), **options)
     columns = [column.to_numpy() for column in table.columns]
-    names = _with_axes(names) if names else default_names(count)
+    if names:
+        names = with_axes(names)
+    else:
+        has_numbers = (
+            columns[0].dtype.kind == "f" and np.isnan(columns[0][:1]).any()
+        )  # of the columns, as pandas writes
+        rows = slice(int(has_numbers), None)
+        begin = first_coordinate([column[rows] for column in columns])
+        columns = [column[rows] for column in columns[1:]] if begin else columns
+        names = default_names(len(columns))
     return {name: values for name, values in zip(names, columns) if values.dtype.kind in "biuf"}
-
-
-def _with_axes(names: list[str]) -> list[str]:
-    """Return distinct names, of which those of a position are x, y and z."""
-    if not set(AXES) <= set(names):
-        roles = [role_of_name(name) for name in names]
-        names = [role if role in AXES and roles.index(role) == k else names[k] for k, role in enumerate(roles)]
-    return distinct_names(names)

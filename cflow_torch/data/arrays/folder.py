@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections import Counter
 from itertools import islice
 from pathlib import Path
-from typing import Any, Callable, Container, Sequence
+from typing import Any, Callable, Container, Dict, List, Mapping, Sequence
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from cflow_torch.data.arrays.cloud_file import SUFFIXES
 from cflow_torch.data.arrays.poses_text import STRUCTURED, files_of_poses, parse_poses, parse_times, read_poses
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.folders import find_folders, natural_key, visible
+from cflow_torch.data.folders import find_folders, natural_key, record_in, visible
 from cflow_torch.data.paths import PathLike, as_path, is_remote, read_start, stem_of, suffix_of
 from cflow_torch.data.trajectory import Trajectory
 from cflow_torch.types import CFlowError
@@ -25,94 +26,136 @@ POSE_FILES = (
     *("poses.txt", "poses.npy", "poses.npz", "poses.csv", "trajectory.txt", "trajectory.csv", "trajectory.npz"),
     "odometry.csv",
 )
+"""Names of files of poses that we prefer to others."""
 GROUND_FOLDER = "ground"
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
+# Words in names of files of poses near a log, or whole names of their folders.
+_WORDS = {"poses", "pose", "trajectory", "trajectories", "odometry", "odom", "gt", "groundtruth"}
 # Suffixes of files that we test for poses and times.
 _TABLES = (".txt", ".csv", ".tum", ".log", ".g2o", ".json", ".jsonl", ".yaml", ".yml", ".npy")
 _NEAR_TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test in other folders
 _FIRST_UNIX, _MOST = 10**17, 50  # nanoseconds in 1973; files or folders
+_MOST_EXACT = 0.5  # share of the sweeps at whose times a file has poses, or it is of another sensor
 _TESTED = 8192  # bytes of a file that tell what it holds
 _FEWEST_POINTS = 20  # lines at the start of a text that may be a cloud
+_MOST_MAPS = 10  # clouds in a log's folder that may be maps, if a folder below has more
 _LARGEST = 1 << 24  # bytes; structured files must be whole to be read, and poses take less
+# Numbers in names of files that count: not one or two digits behind letters, as in lidar0_000001.
+_COUNTERS = re.compile(r"(?<![A-Za-z\d])\d+|(?<=\d[A-Za-z])\d+|\d{3,}|\d+$")
+
+_Kinds = Dict[str, List[Path]]  # clouds of each suffix, or of each pattern of names
 
 
 def find_array_logs(root: PathLike) -> list[Path]:
     """Find the folders of all logs, at most four levels below a folder, sorted.
 
-    A log has two or more clouds of one suffix: in its folder, in a subfolder of `POINT_FOLDERS`, or in one of any name
-    next to poses or times.
+    A log has two or more clouds of one suffix, see `_places`.
     """
     what = "a folder with one point cloud per file, or a folder of such"
-    is_log, is_passed = (lambda folder: bool(_clouds(folder)[1])), (lambda child: child.name != GROUND_FOLDER)
+    is_log, is_passed = (lambda folder: bool(_places(folder))), (lambda child: child.name != GROUND_FOLDER)
     return find_folders(as_path(root), is_log, SEARCH_DEPTH, what, is_passed=is_passed)
 
 
-def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:
-    """Return the folder that holds a log's clouds, and the clouds of each suffix that has two or more."""
-    for parent in _usual_places(folder):
-        kinds = _kinds(parent)
+def _places(folder: Path) -> list[tuple[Path, _Kinds]]:
+    """Return the folders that may hold the clouds of a log, the one that we read first; [] = this is not a log.
+
+    They are the folder itself, unless a folder below it has more than its few clouds, which are then maps; one of
+    `POINT_FOLDERS`; or, next to poses or times, those below it. The largest clouds come first, as others are labels.
+    """
+    own = _kinds(folder)
+    fewest = max(map(len, own.values()), default=0)
+    if fewest > _MOST_MAPS:
+        return [(folder, own)]
+    for parent in (folder / name for name in POINT_FOLDERS):
+        kinds = _larger(parent, fewest)
         if kinds:
-            return parent, kinds
-    below = _below(folder)
-    has_tables = any((folder / name).exists() for name in (*POSE_FILES, "times.txt"))
-    if has_tables or (len(below) == 1 and any(find_tables(folder))):
-        return next(iter(below.items()), (folder, {}))
-    return folder, {}
+            return [(parent, kinds)]
+    below = {path: _larger(path, fewest) for path in sorted(visible(folder)) if path.name != GROUND_FOLDER}
+    below = {path: kinds for path, kinds in below.items() if kinds}
+    if own and not below:
+        return [(folder, own)]
+    is_log = any(path.name in (*POSE_FILES, "times.txt") for path in _tables(folder))
+    if is_log or (len(below) == 1 and (own or find_pose_files(folder) or find_times_files(folder))):
+        return sorted(below.items(), key=lambda place: -_bytes_of(place[1]))
+    return []
 
 
-def _usual_places(folder: Path) -> list[Path]:
-    return [folder, *(folder / name for name in POINT_FOLDERS)]
+def _larger(folder: Path, fewest: int) -> _Kinds:
+    """Return the kinds of clouds in a folder that have more files, and are no results of ours."""
+    kinds = {kind: files for kind, files in _kinds(folder).items() if len(files) > fewest}
+    return {} if kinds and record_in(visible(folder)) else kinds
 
 
-def _below(folder: Path) -> dict[Path, dict[str, list[Path]]]:
-    """Return the folders below a log's that hold clouds, and these of each suffix."""
-    kinds = {path: _kinds(path) for path in sorted(visible(folder))}
-    return {path: kinds for path, kinds in kinds.items() if kinds and path.name != GROUND_FOLDER}
+def _bytes_of(kinds: _Kinds) -> int:
+    """Return the size of a cloud in the middle."""
+    files = sorted(next(iter(kinds.values())))
+    return files[len(files) // 2].stat().st_size
 
 
-def other_folders(folder: Path, parent: Path) -> list[str]:
+def other_folders(folder: Path) -> list[str]:
     """Return the names of folders that hold clouds as the one that is read, if it has not one of the usual names."""
-    return [] if parent in _usual_places(folder) else [path.name for path in _below(folder) if path != parent]
+    return [path.name for path, _ in _places(folder)[1:]]
 
 
-def _kinds(folder: Path) -> dict[str, list[Path]]:
+def _kinds(folder: Path) -> _Kinds:
     """Return the clouds in a folder, of each suffix that has two or more, or of each pattern of names.
 
     Texts count if there are no other clouds, if several have names of one pattern, and if the first one is a cloud.
     """
     files = [path for path in visible(folder) if stem_of(path).lower() not in _OTHER_STEMS]
     kinds = _alike([path for path in files if suffix_of(path) in SUFFIXES])
+    kinds = {kind: same for kind, same in kinds.items() if not _is_column(min(same))}
     texts = [path for path in files if suffix_of(path) in cloud_text.SUFFIXES]
     counts = Counter(map(_pattern, texts))
     texts = [] if kinds else [path for path in texts if counts[_pattern(path)] > 1]
     return kinds or {kind: same for kind, same in _alike(texts).items() if _is_text_cloud(min(same))}
 
 
-def _alike(files: Sequence[Path]) -> dict[str, list[Path]]:
+def _alike(files: Sequence[Path]) -> _Kinds:
     """Return the files of each suffix that has two or more, or of each pattern of names.
 
     They have several patterns if mostly the same numbers are in names that differ otherwise: front_001.pcd,
-    rear_001.pcd.
+    rear_001.pcd. Names that differ only by one or two digits behind letters, lidar0_1.pcd and lidar1_1.pcd, need
+    numbers of one range.
     """
-    suffixes: dict[str, list[Path]] = {}
-    for path in files:
-        suffixes.setdefault(path.name[len(stem_of(path)) :].lower(), []).append(path)
-    kinds: dict[str, list[Path]] = {}
-    for suffix, same in suffixes.items():
-        patterns: dict[str, list[Path]] = {}
-        for path in same:
-            patterns.setdefault(_pattern(path), []).append(path)
-        numbers = [{"-".join(re.findall(r"\d+", stem_of(path))) for path in each} for each in patterns.values()]
+    kinds: _Kinds = {}
+    for suffix, same in _grouped(files, lambda path: path.name[len(stem_of(path)) :].lower()).items():
+        patterns = _grouped(same, _pattern)
+        numbers = [{tuple(_COUNTERS.findall(stem_of(path))) for path in each} for each in patterns.values()]
         fewest = min(map(len, numbers))
-        are_sensors = fewest > 1 < len(patterns) and 2 * len(set.intersection(*numbers)) > fewest
-        kinds.update(patterns if are_sensors else {suffix: same})
+        are_same = 2 * len(set.intersection(*numbers)) > fewest
+        if len({re.sub(r"\d", "", pattern) for pattern in patterns}) == 1:
+            last = [[int(each[-1]) for each in found if each] or [0] for found in numbers]
+            are_same = max(map(min, last)) < min(map(max, last))
+        kinds.update(patterns if fewest > 1 < len(patterns) and are_same else {suffix: same})
     return {kind: same for kind, same in kinds.items() if len(same) > 1}
+
+
+def _grouped(files: Sequence[Path], key: Callable[[Path], str]) -> _Kinds:
+    groups: _Kinds = {}
+    for path in files:
+        groups.setdefault(key(path), []).append(path)
+    return groups
 
 
 def _pattern(path: Path) -> str:
     stem = stem_of(path)
-    return re.sub(r"\d+", "*", stem) + path.name[len(stem) :].lower()
+    return _COUNTERS.sub("*", stem) + path.name[len(stem) :].lower()
+
+
+def _is_column(path: Path) -> bool:
+    """Test whether a `.npy` file has one or two numbers per point, such as labels or masks."""
+    if path.suffix.lower() != ".npy":
+        return False
+    try:
+        with file_errors(path):
+            file = io.BytesIO(read_start(path, _TESTED))
+            np.lib.format.read_magic(file)
+            shape, _, kind = np.lib.format.read_array_header_1_0(file)
+    except CFlowError:
+        return False
+    return kind.kind in "biuf" and (len(shape) == 1 or (len(shape) == 2 and max(shape) > 2 and min(shape) < 3))
 
 
 def _is_text_cloud(path: Path) -> bool:
@@ -135,7 +178,7 @@ def find_clouds(folder: Path, suffix: str | None) -> list[Path]:
 
     Fewer than two clouds, and several kinds of clouds without a `suffix`, are a `CFlowError`.
     """
-    parent, kinds = _clouds(folder)
+    parent, kinds = next(iter(_places(folder)), (folder, {}))
     if suffix is not None:
         kinds = {kind: files for kind, files in kinds.items() if kind in (suffix, "." + suffix.lower().lstrip("."))}
     if not kinds:
@@ -150,12 +193,12 @@ def find_clouds(folder: Path, suffix: str | None) -> list[Path]:
     return files if stamps is None else [files[k] for k in np.argsort(stamps, kind="stable")]
 
 
-def resolve(folder: Path, setting: PathLike | None, names: Sequence[str], what: str, *elsewhere: Path) -> Path | None:
+def resolve(folder: Path, setting: PathLike | None, names: Sequence[str], what: str) -> Path | None:
     """Return the file or folder that a setting names, or that "auto" finds; None = none."""
     if setting is None:
         return None
     if setting == "auto":
-        found = [parent for parent in (*(folder / name for name in names), *elsewhere) if parent.exists()]
+        found = [parent for parent in (folder / name for name in names) if parent.exists()]
         return only_one(found, folder, what)
     path = as_path(setting)
     path = path if is_remote(path) or path.is_absolute() or path.exists() else folder / path
@@ -172,47 +215,122 @@ def only_one(found: Sequence[Path], folder: Path, what: str) -> Path | None:
     return found[0] if found else None
 
 
-def find_tables(folder: Path, clouds: Container[Path] = ()) -> tuple[list[Path], list[Path]]:
-    """Find what holds poses in a folder, files or folders with a file per pose, and files of times, by their contents.
+def _tables(folder: Path, clouds: Container[Path] = ()) -> list[Path]:
+    """Return the files in a folder that may hold poses or times, without the `clouds`."""
+    files = [path for path in sorted(visible(folder)) if path not in clouds]
+    return [path for path in files if suffix_of(path) in _TABLES or path.name in POSE_FILES]
 
-    Files of times also say so in their name, because a column of numbers may be anything. We read the start of each,
-    without the `clouds`.
+
+def find_times_files(folder: Path, clouds: Container[Path] = ()) -> list[Path]:
+    """Find the files of times in a folder, by names that say so and by their start: a column may be anything."""
+    named = [path for path in _tables(folder, clouds) if re.search("time|stamp", path.stem.lower())]
+    return [path for path in named if _start_of(path, parse_times) is not None]
+
+
+def find_pose_files(folder: Path, clouds: Container[Path] = ()) -> list[Path]:
+    """Find what holds poses in a folder by the start: files, and folders with a file per pose.
+
+    Files that are called as poses (`POSE_FILES`) need no test.
     """
-    tables = sorted(path for path in visible(folder) if suffix_of(path) in _TABLES and path not in clouds)
-    folders = sorted(path for path in visible(folder) if path.is_dir())
-    starts = {path: _start_of(path, parse_poses) for path in tables}
-    poses = [path for path, start in starts.items() if start is not None and len(start.poses) > 1]
-    times = [path for path in tables if re.search("time|stamp", path.stem.lower())]
-    times = [path for path in times if _start_of(path, parse_times) is not None]
-    for path in folders:
+    poses = [path for path in _tables(folder, clouds) if path.name in POSE_FILES or _have_poses(path)]
+    for path in sorted(path for path in visible(folder) if path.is_dir()):
         files = files_of_poses(path)
         poses += [path] if len(files) > 1 and _has_one_pose(files[0]) else []
-    return poses, times
+    return poses
 
 
-def find_poses_near(folder: Path, times_ns: Sequence[int], tell: Callable[[str], None]) -> Trajectory | None:
-    """Find the file of text that has poses at the unix times of most sweeps: below a folder, and two levels above it.
+def _have_poses(path: Path) -> bool:
+    start = _start_of(path, parse_poses)
+    return start is not None and len(start.poses) > 1
+
+
+def find_poses(
+    folder: Path,
+    clouds: Container[Path],
+    times_ns: Sequence[int] | None,
+    fits: Callable[[Trajectory], bool],
+    tell: Callable[[str], None],
+) -> Trajectory | None:
+    """Find the poses of a log in its folder, else near it.
+
+    Args:
+        folder: its folder.
+        clouds: files that hold no poses.
+        times_ns: of its sweeps; None = unknown.
+        fits: tests whether poses belong to the sweeps.
+        tell: is called with what the user should know.
+
+    Convention: of several files that fit, those with one of `POSE_FILES` count, near a log those with its name, then
+        those with poses at exactly the times of the sweeps. If several are left in the folder, that is a `CFlowError`;
+        near it, none is used. A text in the folder of a log is returned if nothing fits, because it should.
+    """
+    own = find_pose_files(folder, clouds)
+    named = only_one([path for path in own if path.name in POSE_FILES], folder, "poses")
+    read = {} if named is None else {named: read_poses(named)}
+    read.update(read_all([path for path in own if path != named], read_poses, tell))
+    found = {path: each for path, each in read.items() if fits(each)}
+    near = None if found else find_poses_near(folder, folder.resolve().name, times_ns, fits, tell)
+    if near is None and not found:
+        found = {path: each for path, each in read.items() if path == named or suffix_of(path) in _NEAR_TABLES}
+    file = only_one(_preferred(found, [named] if named else [], times_ns), folder, "poses")
+    if file is None:
+        return near
+    tell("" if file == named else f"its poses are those of {file.name}")
+    return found[file]
+
+
+def find_poses_near(
+    folder: Path,
+    name: str,
+    times_ns: Sequence[int] | None,
+    fits: Callable[[Trajectory], bool],
+    tell: Callable[[str], None],
+) -> Trajectory | None:
+    """Find the file of text near a folder that has its poses: below it, and two levels above it; see `find_poses`.
 
     Of folders next to the log or below it, we look only into those that hold nothing but tables, as others are logs. We
-    read the start of at most 50 files in each of at most 50 folders. None = no file has them, or several do. `tell` is
-    called with what the user should know of it.
+    read the start of at most 50 files in each of at most 50 folders. Files without unix times, or for sweeps without
+    them, must have the name of the log or one of `_WORDS`, or be in a folder that is called so.
     """
-    if is_remote(folder) or times_ns[0] < _FIRST_UNIX:
-        return None
     top = folder.resolve()
-    levels = [top, *islice(top.parents, 2)]
+    levels = [] if is_remote(folder) else [top, *islice(top.parents, 2)]
     children = {child: sorted(visible(child))[:_MOST] for level in levels for child in sorted(visible(level))[:_MOST]}
-    plain = [files for files in children.values() if all(suffix_of(file) in _TABLES for file in files)]
-    files = [file for files in (*map(visible, levels), *plain) for file in files if suffix_of(file) in _NEAR_TABLES]
-    starts = {file: _start_of(file, parse_poses) for file in files}
-    timed = [file for file, start in starts.items() if start is not None and start.times_ns is not None]
-    found = [each for each in read_all(timed, read_poses, tell).values() if each.covers(times_ns)]
-    names = " and ".join(each.source for each in found)
-    if len(found) > 1:
-        tell(f"there are poses at the times of its sweeps in {names}: choose one with data.poses=FILE")
-    elif found:
-        tell(f"its poses are those of {names}, which has them at the times of its sweeps")
-    return found[0] if len(found) == 1 else None
+    tables = [files for files in children.values() if all(suffix_of(file) in _TABLES for file in files)]
+    words = {file: re.split("[^a-z]+", file.stem.lower()) for level in levels for file in visible(level)}
+    words.update({file: [re.sub("[^a-z]", "", file.parent.name.lower())] for files in tables for file in files})
+    of_name = re.compile(rf"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])")
+    own = [file for file in words if of_name.search(file.stem)]
+    is_unix = times_ns is not None and times_ns[0] >= _FIRST_UNIX
+    called = {file for file in words if file in own or not _WORDS.isdisjoint(words[file])}
+    texts = [file for file in words if suffix_of(file) in _NEAR_TABLES and (is_unix or file in called)]
+    starts = {file: _start_of(file, parse_poses) for file in texts}
+    known = [file for file, start in starts.items() if start and (file in called or start.times_ns is not None)]
+    found = {file: each for file, each in read_all(known, read_poses, tell).items() if fits(each)}
+    files = _preferred(found, own, times_ns)
+    names = " and ".join(found[file].source for file in files)
+    if len(files) == 1:
+        tell("" if files[0].stem == name else f"its poses are those of {names}")
+        return found[files[0]]
+    tell(f"there are poses of its sweeps in {names}: choose one with data.poses=FILE" if files else "")
+    return None
+
+
+def _preferred(found: Mapping[Path, Trajectory], named: Sequence[Path], times_ns: Sequence[int] | None) -> list[Path]:
+    """Return the files of poses that are left by the rules of `find_poses`."""
+    wanted: Any = [] if times_ns is None else times_ns
+    exact = [
+        path
+        for path, each in found.items()
+        if each.times_ns is not None and _share(wanted, each.times_ns) > _MOST_EXACT
+    ]
+    files = list(found)
+    for better in (named, exact):
+        files = [path for path in files if path in better] or files
+    return files
+
+
+def _share(times_ns: Sequence[int], known: np.ndarray) -> float:
+    return float(np.isin(times_ns, known).mean()) if len(times_ns) else 0.0
 
 
 def read_all(files: Sequence[Path], read: Callable[[Path], Any], tell: Callable[[str], None]) -> dict[Path, Any]:

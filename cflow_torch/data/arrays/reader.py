@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Sequence
 
@@ -14,10 +14,9 @@ from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
 from cflow_torch.data.arrays.cloud_file import in_single, read_columns, read_table, small_arrays
 from cflow_torch.data.arrays.folder import (
     GROUND_FOLDER,
-    POSE_FILES,
     find_clouds,
-    find_poses_near,
-    find_tables,
+    find_poses,
+    find_times_files,
     only_one,
     other_folders,
     read_all,
@@ -105,16 +104,22 @@ class ArraysLog(Log):
         self.files = find_clouds(self.folder, suffix)
         self.bin_layout = self._find_bin_layout(bin_columns)
         self._bin_columns: Any = self.bin_layout if bin_columns == "auto" else bin_columns
-        others = other_folders(self.folder, self.files[0].parent)
+        others = other_folders(self.folder)
         if others:
             self._note(f"we read the clouds in {self.files[0].parent.name}; there are others in {', '.join(others)}")
         self._ground = resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         self.lidar_position = self.ego_T_lidar[:3, 3]
-        trajectory, are_of_lidar = self._trajectory(poses, calibration)
-        stamps = self._times(times, trajectory)
-        if trajectory is None and poses == "auto" and stamps is not None:
-            trajectory = find_poses_near(self.folder, stamps, self._note)
+        stated, file_of_times = self._stated_times(times), None
+        stamps = stated
+        if stated is None and times == "auto":
+            stamps, file_of_times = self._tabled_times()
+        trajectory, are_of_lidar = self._trajectory(poses, calibration, stamps)
+        counted = None if trajectory is None else trajectory.counted(stated).times_ns
+        if stated is None and counted is not None and len(counted) == len(self.files):
+            stamps = counted.tolist()
+        elif file_of_times is not None:
+            self._note(f"the times of its sweeps are those of {file_of_times.name}")
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
         if trajectory is not None and (are_of_lidar or poses_of == "lidar"):
@@ -171,41 +176,42 @@ class ArraysLog(Log):
             self._note(f"its .bin files look like {layout}; data.bin_columns sets another number")
         return layout
 
-    def _trajectory(self, poses: Any, calibration: Any) -> tuple[Trajectory | None, bool]:
+    def _trajectory(self, poses: Any, calibration: Any, stamps: Sequence[int] | None) -> tuple[Trajectory | None, bool]:
         """Return the poses, and whether a calibration converted them to the LiDAR's."""
         if poses is not None and not is_path_like(poses):
             return Trajectory(checked_poses(np.asarray(poses), "poses"), None, False, "poses"), False
-        kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
-        file = resolve(self.folder, poses, POSE_FILES, "poses", kitti)
-        if file is None and poses == "auto":
-            found = [
-                path
-                for path in find_tables(self.folder, self.files)[0]
-                if suffix_of(path) not in poses_text.STRUCTURED or self._fits(path)
-            ]
-            file = only_one(found, self.folder, "poses")
-            self._note(f"its poses are those of {file.name}" if file else "")
-        if file is None:
-            return self._viewpoints() if poses == "auto" else None, False
-        trajectory = poses_text.read_poses(file)
+        if poses == "auto":
+            found = find_poses(self.folder, self.files, stamps, partial(self._fits, stamps), self._note)
+            trajectory = found or self._viewpoints()
+        else:
+            file = resolve(self.folder, poses, (), "poses")
+            trajectory = None if file is None else poses_text.read_poses(file)
+        if trajectory is None:
+            return None, False
         chosen = resolve(self.folder, calibration, ("calib.txt",), "calibration")
         if chosen is None or (calibration == "auto" and not trajectory.is_kitti):
             return trajectory, False
-        T_cam_lidar = transform(read_calibration(chosen), chosen, *CAMERA_KEYS)
+        values = read_calibration(chosen)
+        if calibration == "auto" and values.keys().isdisjoint(CAMERA_KEYS):
+            fix = "if they are KITTI's poses of a camera, download data_odometry_calib.zip, which has it"
+            self._note(f"{chosen.name} has no Tr, so we take the poses for those of the LiDAR: {fix}")
+            return trajectory, False
+        T_cam_lidar = transform(values, chosen, *CAMERA_KEYS)
         converted = np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar
         if calibration == "auto" and _drives_along_x(trajectory.poses) and not _drives_along_x(converted):
             self._note(
-                f"{file} has poses that drive along x, the LiDAR's axis ahead, not along z, the camera's. So we take "
-                f"them for poses of the LiDAR, and ignore Tr of {chosen.name}"
+                f"{trajectory.source} has poses that drive along x, the LiDAR's axis ahead, not along z, the camera's. "
+                f"So we take them for poses of the LiDAR, and ignore Tr of {chosen.name}"
             )
             return trajectory, True
         return trajectory._replace(poses=converted), True
 
-    def _fits(self, path: Path) -> bool:
-        """Test whether a structured file has poses of the sweeps, because such files often hold other poses."""
-        trajectory = poses_text.read_poses(path)
-        rows = self._labelled_rows(trajectory.labels)
-        return trajectory.times_ns is not None or len(trajectory.poses) == len(self.files) or rows is not None
+    def _fits(self, stamps: Sequence[int] | None, trajectory: Trajectory) -> bool:
+        """Test whether poses may be those of the sweeps: by their times, their labels or their number."""
+        trajectory = trajectory.counted(stamps)
+        if stamps is not None and trajectory.times_ns is not None:
+            return trajectory.covers(stamps)
+        return self._rows(len(trajectory.poses), trajectory.labels) is not None
 
     def _viewpoints(self) -> Trajectory | None:
         """Read the poses in VIEWPOINT of `.pcd` files, or in arrays of `.npz` files; None if no file has one."""
@@ -228,27 +234,22 @@ class ArraysLog(Log):
         )
         return Trajectory(poses, None, False, _VIEWPOINT)
 
-    def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
-        """Return the nanoseconds of each sweep; None = unknown."""
-        count = len(self.files)
+    def _stated_times(self, times: Any) -> list[int] | None:
+        """Return the nanoseconds of each sweep by times.txt, or by the names of the files; None = unknown."""
         file = resolve(self.folder, times, ("times.txt",), "times")
-        if file is not None:
-            stamps = poses_text.read_times(file)
-            rows = self._rows(len(stamps), f"times in {file}")
-            if rows is None:
-                raise CFlowError(f"{file} has {len(stamps)} times for {count} sweeps; it needs one each")
-            return stamps[rows].tolist()  # type: ignore[no-any-return]
-        named = times_of_names([stem_of(path) for path in self.files])
-        if named is not None:
-            return named
-        times_ns = None if trajectory is None else trajectory.counted(None).times_ns
-        if times_ns is not None and len(times_ns) == count:
-            return times_ns.tolist()  # type: ignore[no-any-return]
-        tables = find_tables(self.folder, self.files)[1] if times == "auto" else []
-        read = read_all(tables, poses_text.read_times, self._note)
-        file = only_one([table for table, times in read.items() if len(times) == count], self.folder, "times")
-        self._note(f"the times of its sweeps are those of {file.name}" if file else "")
-        return None if file is None else read[file].tolist()
+        if file is None:
+            return times_of_names([stem_of(path) for path in self.files])
+        stamps = poses_text.read_times(file)
+        rows = self._rows(len(stamps), what=f"times in {file}")
+        if rows is None:
+            raise CFlowError(f"{file} has {len(stamps)} times for {len(self.files)} sweeps; it needs one each")
+        return stamps[rows].tolist()  # type: ignore[no-any-return]
+
+    def _tabled_times(self) -> tuple[list[int] | None, Path | None]:
+        """Return the nanoseconds of each sweep in the only other file of so many times, and the file."""
+        read = read_all(find_times_files(self.folder, self.files), poses_text.read_times, self._note)
+        file = only_one([table for table, times in read.items() if len(times) == len(self.files)], self.folder, "times")
+        return (None, None) if file is None else (read[file].tolist(), file)
 
     def _labelled_rows(self, labels: Sequence[str]) -> np.ndarray | None:
         """Return the row of each file in a table whose rows have labels: by its name, its number, or in their order.
@@ -270,11 +271,12 @@ class ArraysLog(Log):
             return None
         return np.array(sorted(range(len(labels)), key=lambda row: natural_key(labels[row])))
 
-    def _rows(self, count: int, what: str, labels: Sequence[str] = ()) -> np.ndarray | None:
+    def _rows(self, count: int, labels: Sequence[str] = (), what: str = "") -> np.ndarray | None:
         """Return the row of each file in a table of `count` rows, one per sweep; None = the table does not fit.
 
         Labels of the rows may be the names of the files. If files are missing, their numbers tell the rows, from 0 or 1
-        on, and we say so. The last number must be near the end of the table, else the table is of another rate.
+        on, and we say so if you pass `what` the rows are. The last number must be near the end of the table, else the
+        table is of another rate.
         """
         labelled = self._labelled_rows(labels) if len(labels) == count else None
         if count == len(self.files) or labelled is not None:
@@ -284,7 +286,9 @@ class ArraysLog(Log):
         fitting = [numbers - first for first in firsts if (numbers >= first).all() and (numbers < first + count).all()]
         if len(fitting) != 1 or len(set(numbers)) < len(numbers) or not self._reaches(fitting[0].max(), count):
             return None
-        self._note(f"it has {count} {what} for {len(self.files)} sweeps, so each takes that of its number")
+        self._note(
+            f"it has {count} {what} for {len(self.files)} sweeps, so each takes that of its number" if what else ""
+        )
         return fitting[0]
 
     def _reaches(self, last: int, end: int) -> bool:
@@ -301,7 +305,7 @@ class ArraysLog(Log):
             self.has_sparse_poses = trajectory.is_sparse(stamps)
             self.trajectory = trajectory.times_ns, trajectory.poses
         else:
-            given = self._rows(len(trajectory.poses), f"poses in {source}", trajectory.labels)
+            given = self._rows(len(trajectory.poses), trajectory.labels, f"poses in {source}")
             if given is None:
                 raise CFlowError(
                     f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, or poses "

@@ -11,12 +11,15 @@ from typing import Sequence
 # few seconds apart, hardly any a few milliseconds.
 _UNITS = {1: 1_200_000, 10**3: 1_200_000, 10**6: 5_000_000, 10**9: 0}
 _LONGEST = 10**11  # the same, of unix times
+_LIMIT = 1 << 63  # nanoseconds that an int64 cannot hold
 _UNIX = range(10**18, 41 * 10**17)  # nanoseconds since 1970: from 2001 to 2099
 # After colons, "-08:00" and "-0800" are a time zone, else "-123456" is a fraction.
 _DATE = re.compile(
     r"(?<!\d)(\d{4})\D?(\d\d)\D?(\d\d)\D(\d\d)\D?(\d\d)\D?(\d\d)"
     r"(?:(?:[.,_]|(?<!:\d\d)[^\d+])(\d+)(?![\d:]))?(?:([+-])(\d\d):?(\d\d)(?!\d))?"
 )
+# A date of 14 digits, with milli-, micro- or nanoseconds or without.
+_DIGITS = re.compile(r"(?<!\d)((?:19|20)\d\d)([01]\d)([0-3]\d)([0-2]\d)([0-5]\d)([0-5]\d)(\d{3}|\d{6}|\d{9}|)(?!\d)")
 _CLOCK = re.compile(r"(?<![\d:])(\d\d?):(\d\d):(\d\d)(?:[.,](\d+))?(?![\d:])")
 _STAMP = re.compile(r"(?<!\d)([1-9]\d{12}|[1-9]\d{15,17}|[1-8]\d{18})(?!\d)")  # no numbers with zeros in front
 # Seconds and a fraction: unix seconds anywhere in a name, or the only number of a name.
@@ -68,14 +71,16 @@ def times_of_names(names: Sequence[str]) -> list[int] | None:
     """Return the nanoseconds that names of files state; None if they do not state times, or repeat one.
 
     Names contain a unix time in milliseconds (13 digits), microseconds (16, 17) or nanoseconds (18, 19), unix seconds
-    and a fraction ("1700000000.05", "1700000000_050000000"), or a date; or their only number is seconds ("0.05").
-    Fractions are decimals, unless their numbers of digits differ and the longest has nine: then they are nanoseconds
-    without leading zeros. A last number that counts the files is ignored.
+    and a fraction ("1700000000.05", "1700000000_050000000"), or a date, also without separators; or their only number
+    is seconds ("0.05"). Fractions are decimals, unless their numbers of digits differ and the longest has nine: then
+    they are nanoseconds without leading zeros. A last number that counts the files is ignored.
     """
     times = None
     if not names:
         return None
     names = _without_counters(names)
+    if all(map(_DIGITS.search, names)):
+        names = [_DIGITS.sub(_with_separators, name) for name in names]
     stamps = [_STAMP.search(name) for name in names]
     seconds = [[pattern.search(name) for name in names] for pattern in _SECONDS]
     if all(stamps):
@@ -84,7 +89,13 @@ def times_of_names(names: Sequence[str]) -> list[int] | None:
         if times is None and all(matches):
             times = _with_fractions([(match[1], match[2]) for match in matches if match])
     times = times or nanoseconds_of_dates(names)
-    return times if times is not None and len(set(times)) == len(times) else None
+    are_times = times is not None and max(times) < _LIMIT and len(set(times)) == len(times)
+    return times if are_times else None
+
+
+def _with_separators(date: re.Match[str]) -> str:
+    *numbers, fraction = date.groups()
+    return "{}-{}-{}T{}:{}:{}".format(*numbers) + (f".{fraction}" if fraction else "")
 
 
 def _without_counters(names: Sequence[str]) -> Sequence[str]:

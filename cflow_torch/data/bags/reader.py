@@ -14,7 +14,7 @@ from cflow_torch.data.arrays.folder import find_poses_near
 from cflow_torch.data.arrays.poses_text import read_poses
 from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, is_pose, points_of, sample, sorted_poses
 from cflow_torch.data.file_errors import file_errors, shortened
-from cflow_torch.data.folders import search
+from cflow_torch.data.folders import search, visible
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
 from cflow_torch.data.point_times import find_times
@@ -154,8 +154,13 @@ class BagLog(Log):
         """Return the poses of the file that is named, of the bag or, with "auto", of a file near the bag."""
         trajectory = self._poses_of_file(poses) or self._poses_of_bag(topics, poses, tracks)
         if trajectory is None and poses == "auto":
-            trajectory = find_poses_near(self.path.parent, self.timestamps, self._note)
+            trajectory = find_poses_near(
+                self.path.parent, self.log_id, self.timestamps, self._is_covered_by, self._note
+            )
         return trajectory
+
+    def _is_covered_by(self, trajectory: Trajectory) -> bool:
+        return trajectory.covers(self.timestamps)
 
     def _poses_of_bag(self, topics: dict[str, str], poses: str | None, tracks: dict[str, Any]) -> Trajectory | None:
         """Return the poses of transforms or of a topic; None = there are none. Clouds of another clock are shifted."""
@@ -456,7 +461,7 @@ def _check_version(files: list[Path]) -> None:
 def _bags_in(folder: Path) -> list[Path]:
     if (folder / "metadata.yaml").is_file():
         return [folder]
-    files = [file for file in folder.iterdir() if file.suffix in (*SUFFIXES, _ACTIVE) and file.is_file()]
+    files = [file for file in visible(folder) if file.suffix in (*SUFFIXES, _ACTIVE) and file.is_file()]
     parts = {part for file in files for part in _parts(file)[1:]}
     return [file for file in files if file not in parts]
 
@@ -469,7 +474,7 @@ def _parts(path: Path) -> list[Path]:
         named = re.findall(r"^\s*- (\S+\.(?:db3|mcap))\s*$", text, re.MULTILINE)
         if all((path / name).is_file() for name in named):
             return [path]
-        files = [file for file in path.iterdir() if file.suffix in SUFFIXES]  # renamed since
+        files = [file for file in visible(path) if file.suffix in SUFFIXES]  # renamed since
         return sorted(files, key=_part_number) or [path]
     match = _PART.fullmatch(path.stem)
     if match is None or int(match[2]) != 0:

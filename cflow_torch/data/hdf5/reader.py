@@ -5,12 +5,13 @@ from __future__ import annotations
 import weakref
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Sequence
 
 import numpy as np
 
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.folders import visible
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, source_for_random_access
@@ -38,7 +39,12 @@ def find_hdf5_scenes(root: PathLike) -> list[Path]:
         return [root]
     if not root.is_dir():
         raise CFlowError(f"{root} is neither a file nor a folder; pass a scene (.h5) or a folder of scenes")
-    return sorted(root.glob("*.h5")) or sorted(root.glob("*/*.h5"))
+    below = [path for folder in visible(root) for path in visible(folder)]
+    return sorted(_scenes(visible(root))) or sorted(_scenes(below))
+
+
+def _scenes(paths: Sequence[Path]) -> list[Path]:
+    return [path for path in paths if path.suffix == ".h5"]
 
 
 class HDF5Log(Log):

@@ -208,7 +208,7 @@ class KITTILog(ArraysLog):
         is_raw = self.drive.layout == "raw"
         folder = self.drive.root / "oxts" / "data" if is_raw else self.drive.root / "oxts"
         with remote_errors(folder):
-            known = [file for file in sorted(folder.glob("*.txt")) if file.stat().st_size > 0]
+            known = [file for file in sorted(visible(folder)) if file.suffix == ".txt" and file.stat().st_size > 0]
         wanted = {file.stem for file in self.files} if is_raw else {self.drive.clouds.name}
         if times is not None:
             wanted = {file.stem for file in known if int(file.stem) < len(times)}

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from cflow_torch.data.boxes import Boxes, BoxLog, category_indices
 from cflow_torch.data.file_errors import check_columns, file_errors
-from cflow_torch.data.folders import search
+from cflow_torch.data.folders import search, visible
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import PathLike, as_path, exist, source_for_mmap, source_for_random_access
 from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, TOP, LaserCalibration, range_image_points
@@ -57,7 +57,11 @@ def find_waymo_segments(root: PathLike) -> list[Path]:
             f"{root}: .tfrecord is version 1 of the Waymo Open Dataset, which we do not read; download the parquet "
             "files of version 2 (same drives): lidar, lidar_pose, lidar_calibration, vehicle_pose, lidar_box"
         )
-    return sorted(search(root, lambda split: list((split / "lidar").glob("*.parquet")), SEARCH_DEPTH, what))
+    return sorted(search(root, _segments_of, SEARCH_DEPTH, what))
+
+
+def _segments_of(split: Path) -> list[Path]:
+    return [path for path in visible(split / "lidar") if path.suffix == ".parquet"]
 
 
 class WaymoLog(BoxLog):
