@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Callable, Iterable, List
+from typing import Any, Callable, Iterable, List
 
 import numpy as np
 
@@ -285,8 +285,8 @@ def _mask(log: _CheckedLog) -> list[Finding]:
         problem = "" if log.frame[1] else mask_problem(log.sweep(index))
         if problem:
             return [Finding("ground", WRONG, f"the mask of {_name_of(index)} is {problem}", True)]
-    mask = as_numpy(masks[known[0]])
-    share = float(mask.mean()) if len(mask) else 0.0
+    mask: Any = masks[known[0]]
+    share = float(as_numpy(mask).mean()) if len(mask) else 0.0
     return [Finding("ground", RIGHT, f"{100 * share:.0f} % of the points of {_name_of(known[0])}", True)]
 
 

@@ -208,7 +208,8 @@ def _make_pairs(
         around = None if extended is None else extended[start + num_before : second + num_before + _REACH + 1]
         speed = 0.0
         if poses is not None:
-            speed = float(difference(_motions(poses, first, second), np.eye(4))) / (second - first)
+            motion = np.linalg.inv(poses[second]) @ poses[first]
+            speed = float(difference(motion, np.eye(4))) / (second - first)
         least = {OFF: _LEAST_TIMED, TIMES: _LEAST_TIMED}
         shown = [scan for scan in scans if scan == scans[0] or speed >= least.get(scan, _LEAST_SPEED)]
         how = {} if deskew is None else {"deskew": [partial(deskew, index) for index in (first, second)]}

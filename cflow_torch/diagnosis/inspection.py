@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Sequence
+from typing import Any, Sequence
 
 import numpy as np
 import torch
@@ -94,10 +94,11 @@ class Inspection:
 
 
 def mask_problem(sweep: Sweep) -> str:
-    """Return what is wrong with the ground mask of a sweep in metres and z up; "" = nothing. Cost: 10 ms."""
+    """Return what is wrong with the ground mask that a sweep has, in metres and z up; "" = nothing. Cost: 10 ms."""
     rows = slice(None, None, len(sweep.points) // _MOST_MASKED + 1)
     points = as_numpy(sweep.points)[rows, :3]
-    mask = as_numpy(sweep.is_ground)[rows]
+    given: Any = sweep.is_ground
+    mask = as_numpy(given)[rows]
     if len(mask) and mask.all():
         return "that of all points, so no point would have flow: give masks of the ground alone, or none"
     found = as_numpy(find_ground(points))
