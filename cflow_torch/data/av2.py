@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fnmatch import fnmatch
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Callable, NamedTuple, Sequence
@@ -67,7 +68,7 @@ class GroundRaster(NamedTuple):
 def read_ground_raster(map_folder: Path) -> GroundRaster | None:
     """Read the ground raster in the folder `map` of a log; None = it has none. More than one is a `CFlowError`."""
     names = ("*_ground_height_surface____*.npy", "*___img_Sim2_city.json")
-    rasters, alignments = ([path for path in sorted(visible(map_folder)) if path.match(name)] for name in names)
+    rasters, alignments = ([path for path in sorted(visible(map_folder)) if fnmatch(path.name, name)] for name in names)
     if not rasters:
         return None
     if len(rasters) > 1 or len(alignments) != 1:
