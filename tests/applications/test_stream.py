@@ -168,7 +168,7 @@ def test_ground_is_found_by_default_but_a_given_mask_wins():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert all(map(np.array_equal, masks(bare, ground="grid"), found)), "the same without the warning"
-        own = [replace(sweep, is_ground=~sweep.is_ground) for sweep in given]
+        own = [replace(sweep, is_ground=sweep.is_ground & (np.arange(len(sweep.points)) % 9 > 0)) for sweep in given]
         assert all(np.array_equal(mask, sweep.is_ground) for mask, sweep in zip(masks(own), own))
     truth = [sweep.is_ground for sweep in given]
     assert all((mask == ground).mean() > 0.95 for mask, ground in zip(found, truth))

@@ -110,9 +110,8 @@ def test_far_begins_where_the_table_says(numbered, monkeypatch):
 
 def test_objects_higher_than_cars_and_people_have_rows_of_their_own(numbered):
     # A car of 1.4 m, and with a point 2 m above it. The four rows of low objects come first.
-    car = 0.1 * torch.cartesian_prod(torch.arange(45.0), torch.arange(18.0), torch.arange(15.0)).numpy() + np.float32(
-        (-3.95, 1.05, 0.05)
-    )
+    car = 0.4 * torch.cartesian_prod(torch.arange(11.0), torch.arange(5.0), torch.arange(4.0)).numpy()
+    car += np.float32((-3.95, 1.05, 0.05))
     bins = []
     for top in (0.1, 2.0):
         higher = np.concatenate((car, car[-1:] + np.float32((0, 0, top))))
