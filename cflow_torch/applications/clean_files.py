@@ -71,6 +71,8 @@ def write_clean_log(
         (folder / REMOVED_FOLDER).mkdir()
         for index in range(len(log.timestamps)):
             name = cloud_name(log, index)
+            if name in sides:
+                raise CFlowError(f"log {log.log_id}: two of its sweeps have the number {name}")
             file = folder / POINTS_FOLDER / f"{name}{suffix}"
             removed = clean.removed(index)
             moving = int(clean.moving(index).sum())

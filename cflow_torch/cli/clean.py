@@ -28,7 +28,7 @@ from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
 
 MAP_FILE = "map.ply"  # next to its picture, map.png
-_NEEDED = ("residual_flow", "cluster_id", "is_valid", "confidence", "moving")  # of flow files
+_NEEDED = ("residual_flow", "cluster_id", "is_valid", "moving")  # of flow files; remove_stopped needs confidence, too
 
 
 def task(cfg: Clean) -> None:
@@ -58,7 +58,7 @@ def _cleaner(cfg: Clean) -> Callable[[Log], CleanLog]:
     if cfg.flow is None:
         model = make_model(cfg.model, cfg.device)
         return lambda log: CleanLog(log, model, None, cfg.remove_stopped, cfg.model.sweep_interval)
-    stored = stored_flow(cfg.flow, _NEEDED)
+    stored = stored_flow(cfg.flow, (*_NEEDED, "confidence") if cfg.remove_stopped else _NEEDED)
     return lambda log: CleanLog(log, None, partial(stored, log), cfg.remove_stopped, interval_of_flow(cfg, log.log_id))
 
 
@@ -111,7 +111,8 @@ def _write_map(cfg: Clean, log: Log, folder: Path) -> str:
     """Write the map of a log into its folder, in place of one with other voxels, and return a line with its files."""
     file = folder / MAP_FILE
     points, intensity = static_map_with_intensity(MaskedLog(log, stored_masks(folder, log)), cfg.voxel_size)
-    file.unlink(missing_ok=True)  # first, so that the record below is never that of another map
+    for older in (file, file.with_suffix(".png")):  # first, so that the record below is never that of another map
+        older.unlink(missing_ok=True)
     write_json(folder / RECORD_FILE, {**read_json(folder / RECORD_FILE), "voxel_size": cfg.voxel_size})
     write_cloud(file, points, None if intensity is None else {"intensity": intensity})
     return f"{file}: {len(points):,} points{_draw(points, log.log_id, file.with_suffix('.png'))}"

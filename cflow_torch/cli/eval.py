@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Sequence
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 
@@ -34,8 +33,7 @@ from cflow_torch.estimate import make_model
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
-from cflow_torch.fleet.changes import check_same_run
-from cflow_torch.fleet.manifest import describe_log
+from cflow_torch.fleet.manifest import are_of_same_log, describe_log
 from cflow_torch.simulator.benchmark import generator_key
 from cflow_torch.stages import CallTime, time_report
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -45,13 +43,16 @@ def task(cfg: Eval) -> float:
     """Run `cflow eval`; returns the score that a sweeper minimises, see `objective`."""
     output = output_folder(cfg)
     scores = Scores(cfg)
-    model = make_model(cfg.model, cfg.device)
+    record = finished_results(cfg, output)
     logs, failures = open_logs(cfg.data)
-    record = finished_results(cfg, output, logs)
     if record is not None:
+        _check_logs(output, record, logs, bool(failures))
         print(f"skipped, its results exist: {output}")
         _print_scores(output, record["results"], record["seconds_per_pair"])
+        with suppress(UnfinishedJob):
+            finish(failures)
         return objective(record["results"])
+    model = make_model(cfg.model, cfg.device)
     read_config(ensure_writable(output))  # one of others fails now, not after the work
     pairs = [(log, index) for log in logs for index in chosen_pairs(log, cfg.data)]
     times: list[CallTime] = []
@@ -106,7 +107,7 @@ class Scores:
                 "label": self._cfg.data["label"],
                 "logs": [{"log_id": log.log_id, "sweeps": len(log.timestamps)} for log in logs],
                 "digest": self._digest.hexdigest()[:16],
-                "input_digest": _input_digest(logs),
+                "inputs": [describe_log(log) for log in logs],
             },
             "versions": versions(),
             "generator": _generator(self._cfg),
@@ -124,10 +125,10 @@ def _print_scores(folder: Path, results: dict[str, Any], seconds: dict[str, Any]
     print(f"{summary(results, seconds)}\n\n{folder}: {format_table(results)}")
 
 
-def finished_results(cfg: Eval, folder: Path, logs: Sequence[Log]) -> dict[str, Any] | None:
-    """Read the record of an earlier run with the same settings, versions and logs in which nothing failed.
+def finished_results(cfg: Eval, folder: Path) -> dict[str, Any] | None:
+    """Read the record of an earlier run with the same settings and versions in which nothing failed.
 
-    None without one, or with `overwrite`. Results of other settings or logs are a `CFlowError`.
+    None without one, or with `overwrite`. Results of other settings are a `CFlowError`.
     """
     file = folder / RESULTS
     if cfg.overwrite or not file.exists():
@@ -135,16 +136,21 @@ def finished_results(cfg: Eval, folder: Path, logs: Sequence[Log]) -> dict[str, 
     record: dict[str, Any] = read_json(file)
     before = {**record.get("config", {}), "versions": record.get("versions"), "generator": record.get("generator")}
     check_made_by(cfg, folder, before, made_by(cfg, generator=_generator(cfg)))
-    if record.get("failures"):
-        return None
-    inputs = record.get("data", {}).get("input_digest")
-    check_same_run(folder, {"input_digest": inputs}, {"input_digest": _input_digest(logs)})
-    return record
+    return None if record.get("failures") else record
 
 
-def _input_digest(logs: Sequence[Log]) -> str:
-    """Hash the ids and time stamps of logs, and three sweeps of each."""
-    return hashlib.sha256(json.dumps([describe_log(log) for log in logs]).encode()).hexdigest()[:16]
+def _check_logs(folder: Path, record: Mapping[str, Any], logs: Sequence[Log], some_failed: bool) -> None:
+    """Compare the logs that could be opened with those of existing results; other ones are a `CFlowError`."""
+    before = {each["log_id"]: each for each in record["data"].get("inputs", ())}
+    now = {log.log_id: describe_log(log) for log in logs}
+    changed = {name for name, log in now.items() if not are_of_same_log(before.get(name, {}), log)}
+    changed |= set() if some_failed else before.keys() - now.keys()
+    if changed:
+        names = ", ".join(sorted(changed))
+        raise CFlowError(
+            f"{folder} has scores of other data: {names} was added, removed or changed; give overwrite=true, or give "
+            "output=FOLDER"
+        )
 
 
 def objective(results: dict[str, Any]) -> float:

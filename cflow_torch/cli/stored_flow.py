@@ -37,7 +37,9 @@ def stored_flow(folder: Any, needed: Sequence[str]) -> Callable[[Log, int], Flow
             raise CFlowError(f"{file} is missing: run `cflow flow` again") from None
         missing = [name for name in needed_of(log.log_id) if getattr(result, name) is None]
         if missing:
-            raise CFlowError(f"{file} lacks {', '.join(missing)}: run `cflow flow` with all contents")
+            raise CFlowError(
+                f"{file} lacks {', '.join(missing)}: run `cflow flow` again with contents=auto overwrite=true"
+            )
         return result
 
     return read

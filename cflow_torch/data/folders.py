@@ -53,7 +53,14 @@ def find_folders(root: Path, is_log: Callable[[Path], bool], depth: int, what: s
 def record_in(files: Sequence[Path]) -> str:
     """Return the name of the record among the files of a folder of results that we wrote; "" = it is none of ours."""
     records = [path for path in files if path.name in (_OF_FLOW, _OF_CLEAN)]
-    return next((path.name for path in records if _OURS in read_bytes(path)), "")
+    return next((path.name for path in records if _is_ours(path)), "")
+
+
+def _is_ours(file: Path) -> bool:
+    try:
+        return file.is_file() and _OURS in read_bytes(file)
+    except (OSError, CFlowError):  # of another user
+        return False
 
 
 def visible(folder: Path) -> list[Path]:

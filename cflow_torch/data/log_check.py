@@ -167,9 +167,11 @@ def _frame(log: _CheckedLog) -> list[Finding]:
     Then check the ego motion in the frame that the points will have.
     """
     reading, problem = log.frame
-    where = _name_of(log.typical[0])
-    if not problem and known_poses(log) is None:
-        where, problem = "the last sweep", frame_problem(log.sweep(log.typical[-1]).points)[1]
+    checked = log.typical[0]
+    is_last = not problem and known_poses(log) is None
+    if is_last:
+        checked = log.typical[-1]
+        _, problem = frame_problem(log.sweep(checked).points)
     if not problem:
         right = Finding("frame", RIGHT, "metres, around the vehicle, z up", True)
         return [right, *_motion(log, "")]
@@ -179,9 +181,9 @@ def _frame(log: _CheckedLog) -> list[Finding]:
     if unit not in ("", reading):
         reading, problem = unit, f"{READINGS[unit].cause}, because the motion then fits that of the poses"
     fix = f"; {_setting(log, reading)} converts them" if reading else ""
-    wrong = Finding("frame", WRONG, f"in {where} {problem}{fix}", True)
+    wrong = Finding("frame", WRONG, f"in {_name_of(checked)} {problem}{fix}", True)
     # In another frame that we do not know, readings of the poses mean nothing.
-    return [wrong, *(_motion(log, reading) if reading or where == "the last sweep" else [])]
+    return [wrong, *(_motion(log, reading) if reading or is_last else [])]
 
 
 def _fitting(log: Log, readings: Iterable[str]) -> tuple[str, float]:

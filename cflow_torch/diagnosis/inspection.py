@@ -25,6 +25,7 @@ _GROUND = (
     "ground (Sweep.is_ground, see cflow_torch.ground.find_ground)"
 )
 _MISFIT = 0.3  # correlation of a ground mask with the ground that we find; of right ones, 0.87 to 0.97
+_MOST_OF_MASK = 0.9  # share of a mask that is ground as we find it, from which it is right
 _MOST_MASKED = 20_000  # points of a ground mask that are compared
 # What to do about a `Judgement` of two sweeps, by the first of its best readings.
 _ADVICE = {
@@ -103,11 +104,11 @@ def mask_problem(sweep: Sweep) -> str:
         return "that of all points, so no point would have flow: give masks of the ground alone, or none"
     found = as_numpy(find_ground(points))
     if not mask.any():
-        return f"empty, but the sweep {_GROUND}, or none" if found.any() else ""
+        return f"empty, but the sweep {_GROUND}; is_ground=None is 'unknown'" if found.any() else ""
     is_known = are_finite(points)
     both = np.stack([found, mask])[:, is_known].astype(np.float64)
     fit = float(np.corrcoef(both)[0, 1]) if (np.ptp(both, axis=1) > 0).all() else 1.0
-    if fit > _MISFIT:
+    if fit > _MISFIT or found[mask & is_known].mean() > _MOST_OF_MASK:  # the mask may be that of the road alone
         return ""
     fix = "invert the mask, True = ground" if fit < -_MISFIT else "has it the rows of this sweep, in their order?"
     return f"not that of points that lie low: {fix}"

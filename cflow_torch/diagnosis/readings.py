@@ -58,7 +58,7 @@ _TURN = 1.1  # share of a direction over that of its opposite, from which other 
 EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
 # Traffic stays in place without the ego motion, or under a part of it: up to 2.5 times the share as given, if the poses
 # are right. If they are wrong by so many metres, less than this part of that under the right reading is in place.
-_FAR, _OF_FAR = 2.0, 1 / 3
+_FAR, _OF_FAR, _AS_LONG = 2.0, 1 / 3, 0.99
 _OF_ERRORS = 1.2  # least share with another motion in each pair over that as given
 _EXCUSE = 1.1  # share with another motion in each pair over that of a reading with a name
 _SLIGHT, _OBLIQUE = np.radians((2, 10))  # least angles between axes that are turned and those as given, or with a name
@@ -270,6 +270,9 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
 def _is_clear_in(name: str, pair: Pair, shares: Mapping[str, float]) -> bool:
     """Test whether hardly any structure of a pair is in place as given, if a reading moves it far."""
     if name not in shares or difference(pair.transforms[name], pair.transforms[GIVEN]) < _FAR:
+        return True
+    given, read = (np.linalg.norm(pair.transforms[each][:3, 3]) for each in (GIVEN, name))
+    if read >= _AS_LONG * given:  # traffic does not stay in place under a motion as long as that of the vehicle
         return True
     return shares[GIVEN] <= _OF_FAR * shares[name]
 

@@ -116,9 +116,7 @@ def _is_claimed(folder: Path, manifest: Mapping[str, Any]) -> bool:
 
 def _check_manifest(folder: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     check_same_run(folder, before.get("run", {}), now["run"], ["hash"])
-    is_same = all(before.get(key) == now[key] for key in ("log_id", "timestamps"))
-    both = now["sweeps"].keys() & (before.get("sweeps") or {}).keys()
-    if not is_same or any(before["sweeps"][key] != now["sweeps"][key] for key in both):
+    if not are_of_same_log(before, now):
         raise CFlowError(
             f"{folder} has flow of other sweeps (the log has changed since, or two logs have the same name): "
             "remove that folder, or give output=FOLDER"
@@ -136,6 +134,14 @@ def describe_log(log: Log) -> dict[str, Any]:
         with suppress(CFlowError, OSError):
             digests[str(stamps[index])] = _digest(log, index)
     return {"log_id": log.log_id, "timestamps": stamps, "sweeps": digests}
+
+
+def are_of_same_log(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Test whether two results of `describe_log` have the same id, times, and digests of the sweeps that both have."""
+    digests = before.get("sweeps") or {}
+    both = now["sweeps"].keys() & digests.keys()
+    is_same = all(before.get(key) == now[key] for key in ("log_id", "timestamps"))
+    return is_same and all(digests[key] == now["sweeps"][key] for key in both)
 
 
 def clear_log(folder: Path, tracks: Container[str] = ()) -> None:

@@ -239,7 +239,7 @@ def test_clean_clouds_of_an_earlier_flow_are_not_taken_for_complete(
     assert "it is complete" in capsys.readouterr().out
     few = "contents=[residual,cluster_id,score,is_valid]"
     assert cflow(*flow, few, "overwrite=true") == 0 and cflow(*clean, "overwrite=true") == 1
-    assert "lacks confidence, moving: run `cflow flow` with all contents" in capsys.readouterr().err
+    assert "lacks moving: run `cflow flow` again with contents=auto" in capsys.readouterr().err
     assert cflow(*flow, "model.significance=2", "overwrite=true") == 0
     assert cflow(*clean) != 0
     message = capsys.readouterr().err

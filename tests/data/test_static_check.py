@@ -735,7 +735,7 @@ def test_points_in_the_world_without_poses_are_told_by_the_last_sweep(drive):
         return to_world(points, as_matrix(np.eye(3), 20 * (pose[:3, 3] - drive.sweep(0).pose[:3, 3])) @ pose)
 
     (problem,) = find_problems(Wrong(drive, far, poses=lambda _: None))
-    assert "in the last sweep the points lie around x = " in problem
+    assert "in sweep 11 the points lie around x = " in problem
 
 
 def test_masks_and_repeated_sweeps_are_recognised(drive):

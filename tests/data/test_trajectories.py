@@ -886,7 +886,7 @@ def test_labels_and_maps_next_to_clouds_are_not_the_clouds(tmp_path) -> None:
         np.save(tmp_path / f"{name}.npy", np.ones((2000, 3)))
     (tmp_path / "poses.txt").write_text("\n".join(EXACT))
     assert find_array_logs(tmp_path) == [tmp_path]
-    with pytest.warns(CFlowWarning, match="we read the clouds in sweeps; there are others in boxes$"):
+    with pytest.warns(CFlowWarning, match="we read the clouds in sweeps; there are others in boxes, "):
         log: Any = ArraysLog(tmp_path)
     assert len(log) == len(log.poses) == 12 and {file.parent.name for file in log.files} == {"sweeps"}
 
@@ -963,3 +963,31 @@ def test_a_time_that_grows_slowly_is_no_counter(names: list[str], step: int | No
 def test_lines_of_times_have_seconds_or_the_unit_of_their_steps(tmp_path: Path, lines: list[str], step: int) -> None:
     (tmp_path / "times.txt").write_text("\n".join(lines))
     assert np.diff(poses_text.read_times(tmp_path / "times.txt"))[0] == step
+
+
+def test_poses_of_another_log_and_poses_that_do_not_fit_are_not_taken(tmp_path):
+    """B.txt is of B. KITTI's file of a log is used whatever lies next to it; poses.txt of another length is an error."""
+    cloud = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
+    poses = "\n".join(f"1 0 0 {x} 0 1 0 0 0 0 1 0" for x in range(3))
+    for name in ("A", "B"):
+        (tmp_path / "sequences" / name).mkdir(parents=True)
+        for index in range(3):
+            np.save(tmp_path / "sequences" / name / f"{index}.npy", cloud)
+    (tmp_path / "sequences" / "poses_B.txt").write_text(poses)
+    assert ArraysLog(tmp_path / "sequences" / "A").poses is None
+    (tmp_path / "poses").mkdir()
+    (tmp_path / "poses" / "README.md").write_text("of all logs")
+    (tmp_path / "poses" / "A.txt").write_text(poses)
+    assert ArraysLog(tmp_path / "sequences" / "A").poses is not None
+    (tmp_path / "sequences" / "B" / "poses.txt").write_text(poses + "\n1 0 0 9 0 1 0 0 0 0 1 0")
+    (tmp_path / "sequences" / "B" / "imu.txt").write_text(poses)
+    with pytest.raises(CFlowError, match="has 4 poses for 3 sweeps"):
+        ArraysLog(tmp_path / "sequences" / "B")
+
+
+def test_an_empty_first_cloud_and_a_folder_called_as_a_record_hide_no_log(tmp_path):
+    (tmp_path / "drive" / "manifest.json").mkdir(parents=True)
+    np.save(tmp_path / "drive" / "0.npy", np.zeros((0, 3)))
+    for index in (1, 2):
+        np.save(tmp_path / "drive" / f"{index}.npy", np.ones((30, 3)))
+    assert find_array_logs(tmp_path) == [tmp_path / "drive"]

@@ -36,7 +36,7 @@ _WORDS = {"poses", "pose", "trajectory", "trajectories", "odometry", "odom", "gt
 _TABLES = (".txt", ".csv", ".tum", ".log", ".g2o", ".json", ".jsonl", ".yaml", ".yml", ".npy")
 _NEAR_TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test in other folders
 _FIRST_UNIX, _MOST = 10**17, 50  # nanoseconds in 1973; files or folders
-_MOST_EXACT = 0.5  # share of the sweeps at whose times a file has poses, or it is of another sensor
+_MOST_EXACT = 0.5  # a file with poses at exactly the times of more than this share of the sweeps is preferred
 _TESTED = 8192  # bytes of a file that tell what it holds
 _FEWEST_POINTS = 20  # lines at the start of a text that may be a cloud
 _MOST_MAPS = 10  # clouds in a log's folder that may be maps, if a folder below has more
@@ -60,25 +60,26 @@ def find_array_logs(root: PathLike) -> list[Path]:
 def _places(folder: Path) -> list[tuple[Path, _Kinds]]:
     """Return the folders that may hold the clouds of a log, the one that we read first; [] = this is not a log.
 
-    They are the folder itself, unless a folder below it has more than its few clouds, which are then maps; one of
-    `POINT_FOLDERS`; or, next to poses or times, those below it. The largest clouds come first, as others are labels.
+    It is the folder itself. But if a folder below has more clouds, the few of the folder itself may be maps, and come
+    last. Then it is one of `POINT_FOLDERS` or, next to poses or times, that with the largest clouds: others are labels.
     """
     own = _kinds(folder)
     fewest = max(map(len, own.values()), default=0)
     if fewest > _MOST_MAPS:
         return [(folder, own)]
+    passed_over = [(folder, own)] if own else []
     for parent in (folder / name for name in POINT_FOLDERS):
         kinds = _larger(parent, fewest)
         if kinds:
-            return [(parent, kinds)]
+            return [(parent, kinds), *passed_over]
     below = {path: _larger(path, fewest) for path in sorted(visible(folder)) if path.name != GROUND_FOLDER}
     below = {path: kinds for path, kinds in below.items() if kinds}
     if own and not below:
-        return [(folder, own)]
+        return passed_over
     is_log = any(path.name in (*POSE_FILES, "times.txt") for path in _tables(folder))
     if is_log or (len(below) == 1 and (own or find_pose_files(folder) or find_times_files(folder))):
-        return sorted(below.items(), key=lambda place: -_bytes_of(place[1]))
-    return []
+        return [*sorted(below.items(), key=lambda place: -_bytes_of(place[1])), *passed_over]
+    return passed_over
 
 
 def _larger(folder: Path, fewest: int) -> _Kinds:
@@ -155,7 +156,7 @@ def _is_column(path: Path) -> bool:
             shape, _, kind = np.lib.format.read_array_header_1_0(file)
     except CFlowError:
         return False
-    return kind.kind in "biuf" and (len(shape) == 1 or (len(shape) == 2 and max(shape) > 2 and min(shape) < 3))
+    return kind.kind in "biuf" and (len(shape) == 1 or (len(shape) == 2 and shape[0] > 2 and 0 < shape[1] < 3))
 
 
 def _is_text_cloud(path: Path) -> bool:
@@ -260,22 +261,27 @@ def find_poses(
         fits: tests whether poses belong to the sweeps.
         tell: is called with what the user should know.
 
-    Convention: of several files that fit, those with one of `POSE_FILES` count, near a log those with its name, then
-        those with poses at exactly the times of the sweeps. If several are left in the folder, that is a `CFlowError`;
-        near it, none is used. A text in the folder of a log is returned if nothing fits, because it should.
+    Convention: a file with one of `POSE_FILES`, and KITTI's `../../poses/NAME.txt`, is used without a test. Of several
+        other files that fit, those with poses at exactly the times of the sweeps count, near a log first those with its
+        name. If several are left in the folder, that is a `CFlowError`; near it, none is used. A text in the folder of
+        a log is returned if nothing fits, because it should.
     """
     own = find_pose_files(folder, clouds)
-    named = only_one([path for path in own if path.name in POSE_FILES], folder, "poses")
-    read = {} if named is None else {named: read_poses(named)}
-    read.update(read_all([path for path in own if path != named], read_poses, tell))
+    top = folder.resolve()
+    kitti = top.parent.parent / "poses" / f"{top.name}.txt"
+    called = [path for path in own if path.name in POSE_FILES]
+    named = only_one([*called, *([kitti] if kitti.exists() else [])], folder, "poses")
+    if named is not None:
+        return read_poses(named)
+    read = read_all(own, read_poses, tell)
     found = {path: each for path, each in read.items() if fits(each)}
-    near = None if found else find_poses_near(folder, folder.resolve().name, times_ns, fits, tell)
+    near = None if found else find_poses_near(folder, top.name, times_ns, fits, tell, clouds)
     if near is None and not found:
-        found = {path: each for path, each in read.items() if path == named or suffix_of(path) in _NEAR_TABLES}
-    file = only_one(_preferred(found, [named] if named else [], times_ns), folder, "poses")
+        found = {path: each for path, each in read.items() if suffix_of(path) in _NEAR_TABLES}
+    file = only_one(_preferred(found, [], times_ns), folder, "poses")
     if file is None:
         return near
-    tell("" if file == named else f"its poses are those of {file.name}")
+    tell(f"its poses are those of {file.name}")
     return found[file]
 
 
@@ -285,26 +291,13 @@ def find_poses_near(
     times_ns: Sequence[int] | None,
     fits: Callable[[Trajectory], bool],
     tell: Callable[[str], None],
+    clouds: Container[Path] = (),
 ) -> Trajectory | None:
-    """Find the file of text near a folder that has its poses: below it, and two levels above it; see `find_poses`.
+    """Find the file of text near a folder that has the poses of a log: below it, and two levels above it.
 
-    Of folders next to the log or below it, we look only into those that hold nothing but tables, as others are logs. We
-    read the start of at most 50 files in each of at most 50 folders. Files without unix times, or for sweeps without
-    them, must have the name of the log or one of `_WORDS`, or be in a folder that is called so.
+    `name` is that of the log. See `find_poses`.
     """
-    top = folder.resolve()
-    levels = [] if is_remote(folder) else [top, *islice(top.parents, 2)]
-    children = {child: sorted(visible(child))[:_MOST] for level in levels for child in sorted(visible(level))[:_MOST]}
-    tables = [files for files in children.values() if all(suffix_of(file) in _TABLES for file in files)]
-    words = {file: re.split("[^a-z]+", file.stem.lower()) for level in levels for file in visible(level)}
-    words.update({file: [re.sub("[^a-z]", "", file.parent.name.lower())] for files in tables for file in files})
-    of_name = re.compile(rf"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])")
-    own = [file for file in words if of_name.search(file.stem)]
-    is_unix = times_ns is not None and times_ns[0] >= _FIRST_UNIX
-    called = {file for file in words if file in own or not _WORDS.isdisjoint(words[file])}
-    texts = [file for file in words if suffix_of(file) in _NEAR_TABLES and (is_unix or file in called)]
-    starts = {file: _start_of(file, parse_poses) for file in texts}
-    known = [file for file, start in starts.items() if start and (file in called or start.times_ns is not None)]
+    known, own = ([], []) if is_remote(folder) else _poses_called(folder.resolve(), name, clouds, times_ns)
     found = {file: each for file, each in read_all(known, read_poses, tell).items() if fits(each)}
     files = _preferred(found, own, times_ns)
     names = " and ".join(found[file].source for file in files)
@@ -313,6 +306,48 @@ def find_poses_near(
         return found[files[0]]
     tell(f"there are poses of its sweeps in {names}: choose one with data.poses=FILE" if files else "")
     return None
+
+
+def _poses_called(
+    top: Path, name: str, clouds: Container[Path], times_ns: Sequence[int] | None
+) -> tuple[list[Path], list[Path]]:
+    """Return the files near a log that may have its poses, and the files with its name.
+
+    Files without unix times, or for sweeps without them, must have the name of the log or one of `_WORDS`, or be in a
+    folder that is called so. Files with the name of a folder next to the log are of that log.
+    """
+    words = {file: each for file, each in _words_near(top).items() if file not in clouds}
+    others = [path.name for path in visible(top.parent) if path.name not in (top.name, name, *_WORDS) and path.is_dir()]
+    own = [file for file in words if _has_one(file, [name])]
+    called = [file for file in words if not (_WORDS.isdisjoint(words[file]) or _has_one(file, others))]
+    is_unix = times_ns is not None and times_ns[0] >= _FIRST_UNIX
+    texts = [file for file in words if suffix_of(file) in _NEAR_TABLES and (is_unix or file in (*own, *called))]
+    starts = {file: _start_of(file, parse_poses) for file in texts}
+    known = [
+        file for file, start in starts.items() if start and (file in (*own, *called) or start.times_ns is not None)
+    ]
+    return known, own
+
+
+def _has_one(file: Path, names: Sequence[str]) -> bool:
+    """Test whether the name of a file contains one of some names, and not as a part of a longer word."""
+    either = "|".join(map(re.escape, names))
+    return bool(names) and re.search(rf"(?<![A-Za-z0-9])({either})(?![A-Za-z0-9])", file.stem) is not None
+
+
+def _words_near(top: Path) -> dict[Path, list[str]]:
+    """Return the files near a folder, and the words of their names, or that of their folder.
+
+    Of folders next to the log or below it, we look only into those that hold nothing but tables, as others are logs. We
+    look at 50 files in each of 50 folders.
+    """
+    levels = [top, *islice(top.parents, 2)]
+    words = {file: re.split("[^a-z]+", file.stem.lower()) for level in levels for file in visible(level)}
+    for folder in (child for level in levels for child in sorted(visible(level))[:_MOST]):
+        files = sorted(visible(folder))[:_MOST]
+        if all(suffix_of(file) in _TABLES for file in files):
+            words.update(dict.fromkeys(files, [re.sub("[^a-z]", "", folder.name.lower())]))
+    return words
 
 
 def _preferred(found: Mapping[Path, Trajectory], named: Sequence[Path], times_ns: Sequence[int] | None) -> list[Path]:

@@ -64,6 +64,8 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", viewpoint:
         for index in range(len(log.timestamps)):
             sweep = log.sweep(index)
             name = cloud_name(log, index)
+            if name in sides:
+                raise CFlowError(f"log {log.log_id}: two of its sweeps have the number {name}")
             write_sweep(folder / POINTS_FOLDER / f"{name}{suffix}", log, index, sweep, viewpoint)
             sides[name] = SweepSides.of(sweep)
         write_sides(folder, log.log_id, sides, has_viewpoints=viewpoint is not None)
