@@ -966,7 +966,7 @@ def test_lines_of_times_have_seconds_or_the_unit_of_their_steps(tmp_path: Path, 
 
 
 def test_poses_of_another_log_and_poses_that_do_not_fit_are_not_taken(tmp_path):
-    """B.txt is of B. KITTI's file of a log is used whatever lies next to it; poses.txt of another length is an error."""
+    """poses_B.txt is of B. KITTI's file is used whatever lies next to it. A poses.txt that is too long is an error."""
     cloud = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
     poses = "\n".join(f"1 0 0 {x} 0 1 0 0 0 0 1 0" for x in range(3))
     for name in ("A", "B"):
