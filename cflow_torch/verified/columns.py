@@ -24,10 +24,9 @@ from cflow_torch.ops.indices import (
     lazy_zeros,
     mark,
     nonzero_pairs,
-    split_index,
 )
 from cflow_torch.verified.spacing import Spacing
-from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.bev_grid import Grid, Lattice
 
 NUM_SLICES = 4
 OWN = (1 << NUM_SLICES) - 1  # the bits of the pixel itself
@@ -85,7 +84,7 @@ class Pixels:
 class Columns:
     """The columns of B windows, and of B windows of copies.
 
-    Only this class and `position_of` know how positions and slots are numbered.
+    `lattice` numbers the positions, and only this class knows how slots are numbered.
 
     The image of a window has an empty border of `BORDER` positions (b), so that only distant positions need a test:
 
@@ -122,15 +121,15 @@ class Columns:
 
         The border must be False.
         """
-        stride = grid.width + 2 * BORDER
+        lattice = grid.lattice(border=BORDER)
         device = is_occupied.device
-        square = _square(1, stride, device)
+        square = lattice.square(1, device)
         is_column = mark(is_occupied, (flat_nonzero(is_occupied) + square).view(-1))
-        position = _inside(is_column, grid)  # [C]
+        position = _inside(is_column, lattice)  # [C]
         for reach in range(2, spacing.most + 1):
             position = _grow(is_column, position, grid, spacing, reach)
         # Column 0 is said to be in the border, in the last place of its second row: it has only border around it.
-        position = torch.cat((constant((2 * stride - 1,), torch.int64, device), position))
+        position = torch.cat((constant((2 * lattice.stride - 1,), torch.int64, device), position))
         reach_of, tall = _reach_and_tall(grid, position, spacing)
         num_slots = _WORD * -(-num_steps // _WORD)
         columns = cls(
@@ -159,7 +158,7 @@ class Columns:
         """
         is_near = draw(column, len(self.position))
         for _ in range(self.most_reach):
-            near = self.position.index_select(0, flat_nonzero(is_near)) + _square(1, self.stride, column.device)
+            near = self.position.index_select(0, flat_nonzero(is_near)) + self.lattice.square(1, column.device)
             mark(is_near, self.image.index_select(0, near.view(-1)).long())
         is_near[0] = True  # the empty column stays the first one
         own = flat_nonzero(is_near)
@@ -187,10 +186,10 @@ class Columns:
             tall=None,
         )
 
-    @property
-    def stride(self) -> int:
-        """Positions from a row of an image to the next one."""
-        return self.grid.width + 2 * BORDER
+    @cached_property
+    def lattice(self) -> Lattice:
+        """Numbers the positions of the images."""
+        return self.grid.lattice(border=BORDER)
 
     @property
     def num_slots(self) -> int:
@@ -218,7 +217,7 @@ class Columns:
         """Return the column at the positions that are `shift` away, (K, C) int32."""
         # These lines take 3 % of a window, so they are in place, and in 32 bits unless there are too many positions.
         _, start, _, _, row, col = pixels.place[..., None].unbind(1)  # [K, 1] each
-        index = (row + shift[..., 0]).clamp_(-1, self.grid.height).mul_(self.stride)  # [K, C]
+        index = (row + shift[..., 0]).clamp_(-1, self.grid.height).mul_(self.lattice.stride)  # [K, C]
         index += (col + shift[..., 1]).clamp_(-1, self.grid.width)
         index += start
         return self.image.index_select(0, index.view(-1)).view_as(index)
@@ -250,7 +249,7 @@ class Columns:
         (2 reach + 1)^2 K items, grouped by the pixel of the list.
         """
         column = self.column_of(pixels)
-        position = self.position.index_select(0, column) + _square(reach, self.stride, column.device)
+        position = self.position.index_select(0, column) + self.lattice.square(reach, column.device)
         around = self.image.index_select(0, position.view(-1)).view_as(position)  # [(2 reach + 1)^2, K]
         return self.pixel_at((around + pixels.step * len(self.position)).view(-1), count)
 
@@ -308,7 +307,7 @@ class Columns:
             return within
         wide = flat_nonzero(self.reach > 1)  # [K]
         reach_of_wide = self.reach.index_select(0, wide)[:, None]  # [K, 1]
-        place = self.position.index_select(0, wide) + _square(1, self.stride, wide.device)
+        place = self.position.index_select(0, wide) + self.lattice.square(1, wide.device)
         # The 3 x 3 columns around each one, which is in the middle: [9 K].
         beside = self.image.index_select(0, place.view(-1))
         for reach in range(2, self.most_reach + 1):
@@ -320,7 +319,8 @@ class Columns:
     @cached_property
     def _neighbours(self) -> Tensor:
         """(4, C + 1) int32, column to the left and to the right of each column, above and below it; 0 = none."""
-        steps = constant(((-1,), (1,), (-self.stride,), (self.stride,)), torch.int64, self.image.device)
+        stride = self.lattice.stride
+        steps = constant(((-1,), (1,), (-stride,), (stride,)), torch.int64, self.image.device)
         beside = self.position + steps
         return self.image.index_select(0, beside.view(-1)).view_as(beside)
 
@@ -336,16 +336,16 @@ class Columns:
         self.slices.view(torch.int64).copy_(words | self._or_within_reach(words) << NUM_SLICES)
         drawn = slices.t().contiguous()  # [S, C + 1]
         step, column = nonzero_pairs(drawn.bool())
-        area = num_positions(self.grid, 1)
-        if len(self.image) > 2 * area:  # several windows
-            window = floor_divide(self.position.index_select(0, column), area)
+        lattice = self.lattice
+        if len(self.image) > 2 * lattice.area:  # several windows
+            window = floor_divide(self.position.index_select(0, column), lattice.area)
             step, column = gather(window.sort(stable=True).indices, step, column)
         entry = step * len(self.position) + column
         number = torch.arange(pixels_before, pixels_before + len(entry), dtype=torch.int32, device=entry.device)
         self.rank.view(-1).index_copy_(0, entry, number)
         first_slot = (column + columns_before) * self.num_slots
-        window, row_col = _split(self.grid, self.position.index_select(0, column))
-        start = window * area + BORDER * (self.stride + 1)
+        window, row_col = lattice.split(self.position.index_select(0, column))
+        start = window * lattice.area + lattice.first
         place = torch.stack((first_slot, start, window, step, *row_col), 1)
         # With copies, there are at most twice as many columns.
         dtype = index_dtype(max(len(self.image), 2 * self.slices.numel()), place.device)
@@ -353,7 +353,7 @@ class Columns:
 
     def window_row_col(self) -> tuple[Tensor, Tensor]:
         """Return the window of each column, (C + 1,) int64, and its row and column in the image, (2, C + 1) int64."""
-        return _split(self.grid, self.position)
+        return self.lattice.split(self.position)
 
     def fill(self, is_unknown: Tensor) -> None:
         """Set all bits where it is not known what a sweep would have, (C + 1, S) bool.
@@ -375,26 +375,9 @@ class Columns:
         return has_slices & (self.rank.view(-1).index_select(0, entry.view(-1)).view_as(entry) == _EMPTY)
 
 
-def position_of(grid: Grid, window: int | Tensor, row: Tensor, col: Tensor) -> Tensor:
-    """Return the positions of pixels in the images of the windows, (K,) in the dtype of row and column, never 0."""
-    line = row + (window * (grid.height + 2 * BORDER) + BORDER)
-    return line.mul_(grid.width + 2 * BORDER).add_(col).add_(BORDER)
-
-
-def num_positions(grid: Grid, num_windows: int) -> int:
-    """Return the number of positions in the images of B windows, with their borders."""
-    return num_windows * (grid.height + 2 * BORDER) * (grid.width + 2 * BORDER)
-
-
-def _square(reach: int, stride: int, device: torch.device) -> Tensor:
-    """Return what to add to positions for those around, up to `reach` each way, ((2 reach + 1)^2, 1) int64."""
-    line = range(-reach, reach + 1)
-    return constant(tuple((down * stride + right,) for down in line for right in line), torch.int64, device)
-
-
-def _inside(is_column: Tensor, grid: Grid) -> Tensor:
+def _inside(is_column: Tensor, lattice: Lattice) -> Tensor:
     """Clear the borders of images, (B * area,) bool, and list the positions that remain, (C,) int64."""
-    images = is_column.view(-1, grid.height + 2 * BORDER, grid.width + 2 * BORDER)
+    images = is_column.view(-1, lattice.height + 2 * BORDER, lattice.stride)
     images[:, :BORDER] = images[:, -BORDER:] = False
     images[:, :, :BORDER] = images[:, :, -BORDER:] = False
     return flat_nonzero(is_column)
@@ -406,25 +389,18 @@ def _grow(is_column: Tensor, position: Tensor, grid: Grid, spacing: Spacing, rea
     `is_column`, (B * area,) bool, which this overwrites, and `position`, (C,) int64, tell the same columns.
     """
     # A neighbour of a column may have this reach although the column itself is nearer.
-    candidates = flat_nonzero(spacing.are_wide(grid, *_split(grid, position), reach, margin=2.0))
-    square = _square(1, grid.width + 2 * BORDER, position.device)
-    around = (position.index_select(0, candidates) + square).view(-1)
-    wide = flat_nonzero(spacing.are_wide(grid, *_split(grid, around), reach))
-    return _inside(mark(is_column, around.index_select(0, wide)), grid)
-
-
-def _split(grid: Grid, position: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the window of K positions, (K,) int64, and row and column in its image, (2, K) int64."""
-    line, col = split_index(position, grid.width + 2 * BORDER)
-    window, row = split_index(line, grid.height + 2 * BORDER)
-    return window, torch.stack((row, col)) - BORDER
+    lattice = grid.lattice(border=BORDER)
+    candidates = flat_nonzero(spacing.are_wide(grid, *lattice.split(position), reach, margin=2.0))
+    around = (position.index_select(0, candidates) + lattice.square(1, position.device)).view(-1)
+    wide = flat_nonzero(spacing.are_wide(grid, *lattice.split(around), reach))
+    return _inside(mark(is_column, around.index_select(0, wide)), lattice)
 
 
 def _reach_and_tall(grid: Grid, position: Tensor, spacing: Spacing) -> tuple[Tensor | None, Tensor | None]:
     """Return `Columns.reach` and `Columns.tall` of columns at positions, (C + 1,) int64."""
     if spacing.most == 1 and not spacing.has_tall:
         return None, None
-    window, row_col = _split(grid, position)
+    window, row_col = grid.lattice(border=BORDER).split(position)
     reach = spacing.reach(grid, window, row_col) if spacing.most > 1 else None
     tall = flat_nonzero(spacing.are_tall(grid, window, row_col, SLICE_HEIGHT)) if spacing.has_tall else None
     return reach, tall

@@ -44,7 +44,6 @@ from cflow_torch.verified.voxel_centroids import (
     Voxels,
     VoxelSearch,
     covariance_of,
-    pixel_key,
     points_of_objects,
 )
 
@@ -139,7 +138,7 @@ class Source:
     offset: Tensor  # (2, K) float64, metres, x and y from that centre to the voxel
     height: Tensor  # (1, K) float64, metres, z of the voxel
     covariance: Tensor  # (6, K) float64, square metres, of the surface and of the noise, as in ops/linear.py
-    target_start: Tensor  # (K,) int64, number of the first pixel of t+1 of its window, see `pixel_key`
+    target_start: Tensor  # (K,) int64, the cell (`Lattice`) of row 0 and column 0 of t+1 of its window
     target_layers: Tensor  # (3, K) int32, in which we search for the target
     elapsed: Tensor  # (K,) float64, sweep intervals from the voxel to t+1
 
@@ -160,7 +159,6 @@ class Source:
         up = constant(((-1,), (0,), (1,)), torch.int64, voxel.device)
         # The noise of a pair is added here, to its source.
         noise = constant((_NOISE**2, 0.0, 0.0, _NOISE**2, 0.0, _NOISE**2), torch.float64, voxel.device)[:, None]
-        corner = constant(((0,), (0,)), torch.int64, voxel.device)  # row and column of the first pixel
         position = take_columns(voxels.position, voxel)  # [3, K]
         centre = take_columns(centre, by_object.of_item)  # [2, K]
         return cls(
@@ -170,7 +168,7 @@ class Source:
             offset=position[:2] - centre,
             height=position[2:],
             covariance=take_columns(covariance, voxel) + noise,
-            target_start=pixel_key(voxels.grid, window * voxels.num_steps, corner),
+            target_start=window * voxels.num_steps * voxels.lattice.area + voxels.lattice.first,
             target_layers=((voxels.layer.index_select(0, voxel) + up) % NUM_LAYERS).int(),
             elapsed=elapsed[window, voxels.step.index_select(0, voxel)],
         )
@@ -396,7 +394,7 @@ def deskew(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion)
     row_col = torch.stack(sweeps.grid.row_col(position)).long()
     moved = replace(points, position=position, place=torch.cat((points.place[:2], row_col)))
 
-    pixel = pixel_key(sweeps.grid, points.window * sweeps.num_steps + points.step, row_col)
+    pixel = sweeps.columns.lattice.cell(points.window * sweeps.num_steps + points.step, *row_col)
     pixel, number = torch.unique(pixel, return_inverse=True)
     pixels = Groups(number, len(pixel))
     first_object = pixels.min(points.object_id, empty=FAR)

@@ -129,11 +129,10 @@ class _Map:
     def __init__(self, sweeps: HeightSlicedSweeps, parts: _Parts) -> None:
         grid = sweeps.grid
         self._cell = max(1, round(_CELL / grid.pixel_size))  # finest pixels
-        # An empty border as wide as the farthest neighbours, so that they need no tests.
-        self._height = (grid.height - 1) // self._cell + 1 + 2 * _REACH
-        self._width = (grid.width - 1) // self._cell + 1 + 2 * _REACH
+        # A border as wide as the farthest neighbours, so that they need no tests.
+        self._lattice = grid.lattice(self._cell, border=_REACH)
         self._num_steps = sweeps.num_steps
-        num_cells = sweeps.batch.num_windows * sweeps.num_steps * self._height * self._width
+        num_cells = sweeps.batch.num_windows * sweeps.num_steps * self._lattice.area
         number = torch.arange(1, len(parts) + 1, dtype=torch.int32, device=parts.step.device)
         place = self._place(parts.window, parts.step, parts.centre)
         self._part = lazy_zeros(num_cells, torch.int32, number.device)  # 0 = none
@@ -144,18 +143,17 @@ class _Map:
 
         `centre` is (2, ...), finest pixels, `window` and `step` are (...).
         """
-        line = torch.arange(-reach, reach + 1, device=centre.device)
-        offset = (line[:, None] * self._width + line).view(-1)
-        place = self._place(window, step, centre)[..., None] + offset
+        square = self._lattice.square(reach, centre.device)[:, 0]
+        place = self._place(window, step, centre)[..., None] + square
         part = self._part.index_select(0, place.view(-1)).view_as(place)
         return (part - 1).clamp_(min=0).long(), part > 0
 
     def _place(self, window: Tensor, step: Tensor, centre: Tensor) -> Tensor:
         """Return the cells of places; the nearest cells for places outside of the region."""
-        row, col = (centre / self._cell).floor_().long() + _REACH
-        row = row.clamp_(_REACH, self._height - 1 - _REACH)
-        col = col.clamp_(_REACH, self._width - 1 - _REACH)
-        return ((window * self._num_steps + step) * self._height + row) * self._width + col
+        row, col = (centre / self._cell).floor_().long()
+        row = row.clamp_(0, self._lattice.height - 1)
+        col = col.clamp_(0, self._lattice.width - 1)
+        return self._lattice.cell(window * self._num_steps + step, row, col)
 
 
 @dataclass(frozen=True)
