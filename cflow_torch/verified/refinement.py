@@ -210,12 +210,9 @@ class Source:
 
 @dataclass(frozen=True)
 class Correspondences:
-    """K voxels of the source, each with the nearest voxel of the target, under a motion."""
+    """The nearest voxel of the target of each of the K voxels of a source, under a motion."""
 
-    source: Tensor  # (K,) int64, voxel of the source
     target: Tensor  # (K,) int64, voxel of the target
-    by_object: Groups  # the correspondences, grouped by object
-    elapsed: Tensor  # (K,) float64, sweep intervals from the source to t+1
     arm: Tensor  # (2, K) float64, metres, from the centre of the object at t+1 to the moved voxel
     weight: Tensor  # (K,) float64, 1 = at the same position, 0 = no pair
     pull: Tensor  # (3, K) float64, metres, information times the residual from the moved voxel to the target
@@ -276,7 +273,7 @@ class Registration:
 
     def _equations(self, rigid: RigidMotion, source: Source) -> Tensor:
         """Return the normal equations of each voxel of the source, (6 + 3, K) float64."""
-        return _normal_equations(self._correspond(source, rigid))
+        return _normal_equations(self._correspond(source, rigid), source.elapsed)
 
     def _correspond(self, source: Source, rigid: RigidMotion) -> Correspondences:
         """Move the source to t+1, and find the nearest voxels of the target."""
@@ -301,10 +298,7 @@ class Registration:
         # In units of 1 / noise^2: two centroids without surfaces, at distance 0, have the identity as information.
         scale = weight * _NOISE**2
         return Correspondences(
-            source=source.voxel,
             target=target,
-            by_object=source.by_object,
-            elapsed=source.elapsed,
             arm=arm,
             weight=weight,
             pull=pull * scale,
@@ -349,19 +343,20 @@ class Registration:
 
         def times(source: Source) -> Tensor:
             pairs = self._correspond(source, rigid)
-            delay = time.index_select(0, pairs.target) - time.index_select(0, pairs.source)
-            weight = (pairs.information[0, 0] + pairs.information[1, 1]) * pairs.elapsed
-            return weight * torch.stack((pairs.elapsed, delay))
+            delay = time.index_select(0, pairs.target) - time.index_select(0, source.voxel)
+            weight = (pairs.information[0, 0] + pairs.information[1, 1]) * source.elapsed
+            return weight * torch.stack((source.elapsed, delay))
 
         square, late = self._source.sum_by_object(times, 2)
         stretch = torch.where(square > 0, 1 + late / square, 1.0)
         return torch.where(stretch < _LEAST_STRETCH, 1.0, stretch)
 
 
-def _normal_equations(pairs: Correspondences) -> Tensor:
+def _normal_equations(pairs: Correspondences, elapsed: Tensor) -> Tensor:
     """Linearise the residuals of K correspondences. Return the normal equations of each, (6 + 3, K) float64.
 
-    First comes the hessian, then the right side, which is the negative gradient.
+    First comes the hessian, then the right side, which is the negative gradient. `elapsed`, (K,) float64, are the sweep
+    intervals from the source to t+1.
 
     The parameters are x, y and the tangent of half the angle. A change of x or y moves the voxel by the elapsed time, a
     change of the tangent by the elapsed time times `lever`. No parameter changes z.
@@ -376,7 +371,7 @@ def _normal_equations(pairs: Correspondences) -> Tensor:
     force = pairs.pull[:2]
     torque = (lever * force).sum(0, keepdim=True)
     # The hessian is quadratic in the elapsed time, the right side is linear.
-    return torch.cat((hessian * pairs.elapsed, force, torque)) * pairs.elapsed
+    return torch.cat((hessian * elapsed, force, torque)) * elapsed
 
 
 def deskew(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion) -> ObjectPoints:
