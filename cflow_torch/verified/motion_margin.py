@@ -59,7 +59,7 @@ def motion_margin(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigi
     speed = torch.linalg.vector_norm(rigid.flow, dim=1)  # [G], metres per sweep interval
     is_fast = speed >= float(TABLE["fast"])
     is_far = rigid.centre.square().sum(1) >= float(TABLE["far"]) ** 2
-    has_history = sweeps.has_history.index_select(0, objects.window(sweeps))
+    has_history = sweeps.has_history.index_select(0, objects.window)
     margin = _margins(sweeps, tree, objects, rigid, is_fast)
     row = 8 * has_history + 4 * _are_tall(sweeps, objects, rigid) + 2 * is_far + is_fast
     bins = Bins.moving + row * Bins.num_margins + bin_of(margin, TABLE["margin"])
@@ -92,7 +92,7 @@ def _margins(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigid: Ri
     """
     pixel, of_object = _list_pixels(tree, objects, rigid.flow.any(1))
     pixels = sweeps.pixels[pixel]  # [K]
-    num_others = 1 + sweeps.num_more.index_select(0, objects.window(sweeps))  # [G], sweeps
+    num_others = 1 + sweeps.num_more.index_select(0, objects.window)  # [G], sweeps
     has_history = num_others > 1
     near = _test_with_copies(sweeps, pixels, of_object, rigid)
     surplus = near.surplus()  # [G, 5]

@@ -38,8 +38,7 @@ def find_slow(sweeps: HeightSlicedSweeps, objects: Objects, flow: Tensor, longes
     """
     if not sweeps.batch.has_pairs:
         return torch.zeros_like(flow)
-    window = objects.window(sweeps)
-    asked = ~(flow.any(1) | sweeps.has_history.index_select(0, window))
+    asked = ~(flow.any(1) | sweeps.has_history.index_select(0, objects.window))
     if longest is not None:
         asked &= objects.length_at_newest(sweeps) <= longest
     only_ahead, only_behind, total = _matched_slices(sweeps, objects, asked)

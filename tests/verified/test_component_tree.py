@@ -135,8 +135,9 @@ def test_the_cut_equals_the_oracle(seed, of_evidence):
     # Random pixels hardly gain anything, so at z = 0 some nodes dissent.
     objects = select_objects(found.sweeps, found.components, found.nodes, verdict, 0.0)
     node = objects.by_node.of_item
-    assert torch.equal(objects.by_object.of_item[objects.first], torch.arange(objects.count))
-    assert torch.equal(objects.first, objects.first.sort().values)
+    first = objects.by_object.first()
+    assert torch.equal(first, first.sort().values)
+    assert torch.equal(objects.window, found.sweeps.pixels.window[first])
     start = 0
     for window, tree in enumerate(found.trees):
         own = found.names(window)
