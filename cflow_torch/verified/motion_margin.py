@@ -130,25 +130,21 @@ def _test_with_copies(sweeps: HeightSlicedSweeps, pixels: Pixels, of_object: Gro
     """
     off = _DISPLACEMENT / sweeps.grid.pixel_size
     offsets = constant(((0, 0), (off, 0), (-off, 0), (0, off), (0, -off)), torch.float64, pixels.slices.device)
-    alike = _group_by_motion(sweeps, pixels, of_object.of_item, rigid)
-    near = count_wins(sweeps, pixels, alike.by_motion, alike.motion[:, None] + offsets).near
-    of_group = Groups(alike.by_motion.max(of_object.of_item, empty=0), of_object.count)
+    by_motion, motion = _group_by_motion(sweeps, pixels, of_object.of_item, rigid)
+    near = count_wins(sweeps, pixels, by_motion, motion[:, None] + offsets).near
+    of_group = Groups(by_motion.max(of_object.of_item, empty=0), of_object.count)
     return Counts(of_group.sum(near.won.t()).t(), of_group.sum(near.lost.t()).t())
 
 
-class _PixelsByMotion(NamedTuple):
-    """K pixels of objects in groups that move alike.
+def _group_by_motion(
+    sweeps: HeightSlicedSweeps, pixels: Pixels, which: Tensor, rigid: RigidMotion
+) -> tuple[Groups, Tensor]:
+    """Group K pixels that move alike; `which` is the object of each one, (K,) int64.
 
     The pixels of an object are a group, except those that its rotation displaces by a pixel or more. Each of these is a
-    group of its own, after the G objects.
+    group of its own, after the G objects. The second result is the motion of each group, (number of groups, 2) float64,
+    (y, x), finest pixels per sweep interval.
     """
-
-    by_motion: Groups  # the K pixels
-    motion: Tensor  # (number of groups, 2) float64, (y, x), finest pixels per sweep interval
-
-
-def _group_by_motion(sweeps: HeightSlicedSweeps, pixels: Pixels, which: Tensor, rigid: RigidMotion) -> _PixelsByMotion:
-    """Group K pixels by motion; `which` is the object of each one, (K,) int64."""
     motion = rigid.pixels_per_interval(sweeps.grid.pixel_size)  # [G, 2]
     position = sweeps.grid.centre(pixels.row_col).flip(0)  # [2, K], x and y
     at_t = position + rigid.flow.index_select(0, which).t() * (sweeps.elapsed_of(pixels) - 1)
@@ -157,7 +153,7 @@ def _group_by_motion(sweeps: HeightSlicedSweeps, pixels: Pixels, which: Tensor, 
     alone = flat_nonzero((rotation.abs() >= 1).any(1))
     group = which.index_copy(0, alone, torch.arange(len(alone), device=which.device) + len(motion))
     motion = torch.cat((motion, local_motion.index_select(0, alone)))
-    return _PixelsByMotion(Groups(group, len(motion)), motion)
+    return Groups(group, len(motion)), motion
 
 
 def _are_lines(sweeps: HeightSlicedSweeps, pixels: Pixels, of_object: Groups) -> Tensor:
