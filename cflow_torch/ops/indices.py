@@ -45,24 +45,6 @@ def gather(index: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
     return tuple(values.index_select(0, index) for values in tensors)
 
 
-def scatter_count(index: Tensor, size: int, weights: Tensor | None = None) -> Tensor:
-    """Count how often each index occurs, or sum its weights.
-
-    Args:
-        index: (N,) int64, 0 ... size - 1.
-        size: S.
-        weights: (N,) or (R, N) numbers; None = 1 each.
-
-    Returns:
-        (S,) int64, or (S,) or (R, S) in the dtype of the weights.
-
-    Cost: one pass, without a synchronisation (`torch.bincount` has one).
-    """
-    weights = torch.ones_like(index) if weights is None else weights
-    sums = weights.new_zeros((*weights.shape[:-1], size))
-    return sums.scatter_add_(-1, index.expand_as(weights), weights)
-
-
 def renumber(index: Tensor, size: int) -> Tensor:
     """Invert a list of K distinct indices, (K,) int64, below the size S.
 
