@@ -1,4 +1,4 @@
-"""Operations on index tensors: select, look up, count, renumber, divide."""
+"""Operations on index tensors: select, look up, renumber, divide."""
 
 from __future__ import annotations
 
@@ -151,6 +151,14 @@ def floor_divide(index: Tensor, divisor: int) -> Tensor:
     if index.device.type == "cpu":
         return torch.from_numpy(np.asarray(index.numpy() // divisor))  # asarray, because 0-d arrays become numbers
     return torch.div(index, divisor, rounding_mode="floor")
+
+
+def divide(values: Tensor, number: float) -> Tensor:
+    """`values / number`, (...) floats, with the same bits on every device.
+
+    The divisor is a tensor, because a GPU multiplies by the reciprocal of a plain number, which rounds differently.
+    """
+    return values / constant((number,), values.dtype, values.device)
 
 
 def split_index(index: Tensor, width: int) -> tuple[Tensor, Tensor]:

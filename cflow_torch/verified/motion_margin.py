@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import constant, flat_nonzero
+from cflow_torch.ops.indices import constant, divide, flat_nonzero
 from cflow_torch.types import MOVING
 from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.columns import Pixels
@@ -148,7 +148,7 @@ def _group_by_motion(
     motion = rigid.pixels_per_interval(sweeps.grid.pixel_size)  # [G, 2]
     position = sweeps.grid.centre(pixels.row_col).flip(0)  # [2, K], x and y
     at_t = position + rigid.flow.index_select(0, which).t() * (sweeps.elapsed_of(pixels) - 1)
-    local_motion = rigid.flow_at(which, at_t).flip(1) / sweeps.grid.pixel_size  # [K, 2]
+    local_motion = divide(rigid.flow_at(which, at_t).flip(1), sweeps.grid.pixel_size)  # [K, 2]
     rotation = local_motion - motion.index_select(0, which)
     alone = flat_nonzero((rotation.abs() >= 1).any(1))
     group = which.index_copy(0, alone, torch.arange(len(alone), device=which.device) + len(motion))

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import constant, draw, flat_nonzero, floor_divide, split_index, take_columns
+from cflow_torch.ops.indices import constant, divide, draw, flat_nonzero, floor_divide, split_index, take_columns
 from cflow_torch.verified.directions import azimuth_bin, elevation_bin
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
@@ -118,7 +118,7 @@ def _median_gaps(batch: Batch) -> tuple[Tensor, Tensor]:
     below = Groups(window * _GAPS + gap, 2 * batch.num_windows * _GAPS).sum(is_gap).view(-1, _GAPS).cumsum(1)
     median = (2 * below < below[:, -1:]).sum(1)  # the first bin that reaches half
     across, up = (median.double() * (below[:, -1] >= _FEWEST)).view(2, -1)
-    return across / _AZIMUTHS, up / (57.3 * _PER_DEGREE)
+    return across / _AZIMUTHS, divide(up, 57.3 * _PER_DEGREE)
 
 
 def _neighbours(line: Tensor, cell: Tensor, num_lines: int, num_cells: int) -> tuple[Tensor, Tensor]:

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.groups import FAR, Groups
-from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_zeros, split_index, take_columns
+from cflow_torch.ops.indices import constant, divide, flat_nonzero, gather, lazy_zeros, split_index, take_columns
 from cflow_torch.ops.medians import masked_median
 from cflow_torch.verified.columns import Pixels
 from cflow_torch.verified.component_tree import Components, NodeKind, Tree
@@ -150,7 +150,7 @@ class _Map:
 
     def _place(self, window: Tensor, step: Tensor, centre: Tensor) -> Tensor:
         """Return the cells of places; the nearest cells for places outside of the region."""
-        row, col = (centre / self._cell).floor_().long()
+        row, col = divide(centre, self._cell).floor_().long()
         row = row.clamp_(0, self._lattice.height - 1)
         col = col.clamp_(0, self._lattice.width - 1)
         return self._lattice.cell(window * self._num_steps + step, row, col)
@@ -249,7 +249,7 @@ def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: fl
     other, is_part = cells.around(window, step, centre[:, None].expand(2, *step.shape), _REACH)  # [steps, of t, 289]
     distance = (_centres(parts, other) - centre[:, None, :, None]).square_().sum(0).sqrt_()
     seconds = (sweeps.batch.seconds - sweeps.batch.seconds[:, 1:2]).abs()[window, step]
-    farthest = max_speed * seconds / sweeps.grid.pixel_size + 1
+    farthest = divide(max_speed * seconds, sweeps.grid.pixel_size) + 1
     nearest = _LEAST_MOVE * parts.length.index_select(0, of_t)
     is_pair = is_part & (distance <= farthest[..., None]) & (distance >= nearest[:, None])
     if sweeps.batch.has_pairs:

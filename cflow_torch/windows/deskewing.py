@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cflow_torch.ops.indices import divide
 from cflow_torch.tensors import read_positions
 from cflow_torch.transforms import relative_transform, rigid_transform
 from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy, check_array, point_rows
@@ -155,4 +156,4 @@ def deskew_objects(window: Window, result: FlowResult, sweep_interval: float = 0
         rotation[:3, 3] = 0
         flow = compensate(flow, rotation)
     times = torch.as_tensor(before.point_times).to(flow.device, torch.float64)
-    return (read_positions([before], flow.device) - flow * (times / interval)).t()
+    return (read_positions([before], flow.device) - flow * divide(times, interval)).t()

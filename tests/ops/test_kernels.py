@@ -11,7 +11,7 @@ from scipy import ndimage
 from cflow_torch.ops import morphology
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import floor_divide, split_index, unique_pairs
+from cflow_torch.ops.indices import divide, floor_divide, split_index, unique_pairs
 from cflow_torch.ops.kornia_engine import close_3x3_kornia
 from cflow_torch.ops.labeling import pad
 from cflow_torch.ops.linear import adjugate, full, upper
@@ -118,6 +118,12 @@ def test_indices_are_divided_like_integers():
         row, col = split_index(index, width)
         assert [tuple(pair) for pair in zip(row.tolist(), col.tolist())] == [divmod(i, width) for i in index.tolist()]
     assert floor_divide(torch.tensor(7), 2) == 3 and floor_divide(torch.tensor(7), 2).shape == ()
+
+
+def test_numbers_are_divided_and_not_multiplied_by_a_reciprocal():
+    values = np.random.default_rng(0).normal(size=(3, 100))
+    assert not np.array_equal(values / 0.1, values * (1 / 0.1))
+    assert np.array_equal(divide(torch.from_numpy(values), 0.1).numpy(), values / 0.1)
 
 
 def test_counts_are_those_of_bincount():
