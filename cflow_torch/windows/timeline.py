@@ -12,7 +12,7 @@ from cflow_torch.config import Config
 from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import CFlowError, Sweep, Window, as_numpy, named_sweeps
 from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.validation import have_same_points, keep_nearest
+from cflow_torch.windows.validation import have_same_points
 
 # Largest plausible distance of an ego position from the one at t+1, metres: 2 s at 50 m/s.
 _FARTHEST_POSE = 100.0
@@ -49,7 +49,6 @@ class Timeline:
     @staticmethod
     def of(windows: Sequence[Window], config: Config, grid: Grid, needs_times: bool) -> Timeline:
         """Check everything but the points, and list the sweeps. Arguments and errors as in `make_batch`."""
-        windows = [keep_nearest(window, config.num_history) for window in windows]
         sources = [source_sweeps(window, config) for window in windows]
         sides = [_side(of_window, is_past=True) for of_window in sources]
         if config.num_future > 0:
