@@ -59,7 +59,7 @@ class Timeline:
         entries: list[Entry] = []
         for index, side in enumerate(sides):
             number = index % len(windows)
-            times = elapsed_times(windows[number], side, config)
+            times = elapsed_times(windows[number], side, config.sweep_interval)
             table[:2, index, 1 : 1 + len(side)] = np.transpose(times)
             # If one sweep lacks times of points, de-skewing the others would shift them against it.
             sweeps = [windows[number].pc1, *(source.sweep for source in sources[number])]
@@ -140,13 +140,14 @@ def _is_same(a: Sweep, b: Sweep) -> bool:
     return have_same_points(a, b)
 
 
-def elapsed_times(window: Window, sources: Sequence[SourceSweep], config: Config) -> list[tuple[float, float]]:
+def elapsed_times(window: Window, sources: Sequence[SourceSweep], sweep_interval: float) -> list[tuple[float, float]]:
     """Return the time from each source to t+1 in sweep intervals and in seconds, negative for sources after t+1.
 
-    We take the time from the time stamps if all sweeps have one, otherwise from `sweep_interval`.
+    The first source is t. We take the time from the time stamps if all sweeps of the window have one, otherwise from
+    `sweep_interval`, seconds.
     """
     if any(sweep.timestamp_ns is None for sweep in window.sweeps):
-        return [(float(source.intervals), source.intervals * config.sweep_interval) for source in sources]
+        return [(float(source.intervals), source.intervals * sweep_interval) for source in sources]
     newest = _nanoseconds(window.pc1, "pc1")
     gaps = [newest - _nanoseconds(source.sweep, source.name) for source in sources]
     past, future = ([sign * gap for gap, s in zip(gaps, sources) if sign * s.intervals > 0] for sign in (1, -1))
