@@ -151,15 +151,18 @@ class Columns:
         self.image.index_copy_(0, self.position[1:], number)
 
     def for_copies(self, column: Tensor) -> tuple[Columns, Tensor]:
-        """Make empty columns for copies of pixels in some columns, (K,) int64, and around these columns.
+        """Make empty columns for copies of pixels in some columns, (K,) int64, and around these, within their reach.
 
         They are at the same places in windows B ... 2 B - 1. `followed_by` appends them to these columns. The second
         result is the column of each copy, (K,) int64.
         """
         is_near = draw(column, len(self.position))
-        for _ in range(self.most_reach):
+        for reach in range(1, self.most_reach + 1):
             near = self.position.index_select(0, flat_nonzero(is_near)) + self.lattice.square(1, column.device)
-            mark(is_near, self.image.index_select(0, near.view(-1)).long())
+            beside = self.image.index_select(0, near.view(-1)).long()
+            if self.reach is not None:  # other windows of the batch may have a larger one
+                beside = beside * (self.reach.index_select(0, beside) >= reach)
+            mark(is_near, beside)
         is_near[0] = True  # the empty column stays the first one
         own = flat_nonzero(is_near)
         half = len(self.image) // 2
