@@ -19,7 +19,6 @@ from cflow_torch.ops.indices import (
     draw,
     flat_nonzero,
     floor_divide,
-    gather,
     index_dtype,
     lazy_zeros,
     mark,
@@ -328,7 +327,7 @@ class Columns:
         return self.image.index_select(0, beside.view(-1)).view_as(beside)
 
     def draw(self, slices: Tensor, columns_before: int = 0, pixels_before: int = 0) -> Pixels:
-        """Draw the height slices of sweeps, and list their pixels, in order of window, step and position.
+        """Draw the height slices of sweeps, and list their pixels, in order of step, window and position.
 
         Args:
             slices: (C + 1, S) uint8, slices of the pixels themselves; row 0 is 0.
@@ -339,16 +338,12 @@ class Columns:
         self.slices.view(torch.int64).copy_(words | self._or_within_reach(words) << NUM_SLICES)
         drawn = slices.t().contiguous()  # [S, C + 1]
         step, column = nonzero_pairs(drawn.bool())
-        lattice = self.lattice
-        if len(self.image) > 2 * lattice.area:  # several windows
-            window = floor_divide(self.position.index_select(0, column), lattice.area)
-            step, column = gather(window.sort(stable=True).indices, step, column)
         entry = step * len(self.position) + column
         number = torch.arange(pixels_before, pixels_before + len(entry), dtype=torch.int32, device=entry.device)
         self.rank.view(-1).index_copy_(0, entry, number)
         first_slot = (column + columns_before) * self.num_slots
-        window, row_col = lattice.split(self.position.index_select(0, column))
-        start = window * lattice.area + lattice.first
+        window, row_col = self.lattice.split(self.position.index_select(0, column))
+        start = window * self.lattice.area + self.lattice.first
         place = torch.stack((first_slot, start, window, step, *row_col), 1)
         # With copies, there are at most twice as many columns.
         dtype = index_dtype(max(len(self.image), 2 * self.slices.numel()), place.device)
