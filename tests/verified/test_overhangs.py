@@ -134,7 +134,7 @@ def test_the_columns_of_copies_do_not_depend_on_other_windows(angles):
     sweeps = HeightSlicedSweeps.of(batch, grid, None, lambda *_: spacing)
     pixels = sweeps.pixels[sweeps.points[(batch.image == 0).nonzero()[:, 0]].of_item]
     copies, _ = sweeps.columns.for_copies(sweeps.columns.column_of(pixels))
-    assert len(copies.position) == 3528
+    assert len(copies.cell) == 3528
 
 
 def test_without_overhangs_a_car_under_a_crown_has_a_wrong_motion(monkeypatch):
