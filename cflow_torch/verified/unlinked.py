@@ -128,15 +128,15 @@ class _Map:
 
     def __init__(self, sweeps: HeightSlicedSweeps, parts: _Parts) -> None:
         grid = sweeps.grid
-        self._cell = max(1, round(_CELL / grid.pixel_size))  # finest pixels
+        self._side = max(1, round(_CELL / grid.pixel_size))  # finest pixels
         # A border as wide as the farthest neighbours, so that they need no tests.
-        self._lattice = grid.lattice(self._cell, border=_REACH)
+        self._lattice = grid.lattice(self._side, border=_REACH)
         self._num_steps = sweeps.num_steps
         num_cells = sweeps.batch.num_windows * sweeps.num_steps * self._lattice.area
         number = torch.arange(1, len(parts) + 1, dtype=torch.int32, device=parts.step.device)
-        place = self._place(parts.window, parts.step, parts.centre)
+        cell = self._cell_of(parts.window, parts.step, parts.centre)
         self._part = lazy_zeros(num_cells, torch.int32, number.device)  # 0 = none
-        self._part.scatter_reduce_(0, place, number, "amax")
+        self._part.scatter_reduce_(0, cell, number, "amax")
 
     def around(self, window: Tensor, step: Tensor, centre: Tensor, reach: int) -> tuple[Tensor, Tensor]:
         """Return the parts in the cells around places, (..., (2 reach + 1)^2), and whether there is one.
@@ -144,13 +144,13 @@ class _Map:
         `centre` is (2, ...), finest pixels, `window` and `step` are (...).
         """
         square = self._lattice.square(reach, centre.device)[:, 0]
-        place = self._place(window, step, centre)[..., None] + square
-        part = self._part.index_select(0, place.view(-1)).view_as(place)
+        cell = self._cell_of(window, step, centre)[..., None] + square
+        part = self._part.index_select(0, cell.view(-1)).view_as(cell)
         return (part - 1).clamp_(min=0).long(), part > 0
 
-    def _place(self, window: Tensor, step: Tensor, centre: Tensor) -> Tensor:
+    def _cell_of(self, window: Tensor, step: Tensor, centre: Tensor) -> Tensor:
         """Return the cells of places; the nearest cells for places outside of the region."""
-        row, col = divide(centre, self._cell).floor_().long()
+        row, col = divide(centre, self._side).floor_().long()
         row = row.clamp_(0, self._lattice.height - 1)
         col = col.clamp_(0, self._lattice.width - 1)
         return self._lattice.cell(window * self._num_steps + step, row, col)
@@ -174,8 +174,8 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     interval = before_t.gather(1, parts.step.index_select(0, other)[:, None])[:, 0]
     centre = take_columns(parts.centre, of_t)
     velocity = (centre - take_columns(parts.centre, other)) / interval  # [2, H]
-    place = centre[..., None] - velocity[..., None] * before_t  # [2, H, S]
-    part, error = _follow(parts, cells, of_t, place)  # [H, S] each
+    expected = centre[..., None] - velocity[..., None] * before_t  # [2, H, S]
+    part, error = _follow(parts, cells, of_t, expected)  # [H, S] each
     moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()  # [H, S]
     is_found, cost = _judge(sweeps, window, error, moved)
     kept = flat_nonzero(_are_best(cost, part, len(parts)))
@@ -209,16 +209,16 @@ def _judge(sweeps: HeightSlicedSweeps, window: Tensor, error: Tensor, moved: Ten
     return is_found, cost.masked_fill(~is_confirmed, math.inf)
 
 
-def _follow(parts: _Parts, cells: _Map, of_t: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+def _follow(parts: _Parts, cells: _Map, of_t: Tensor, expected: Tensor) -> tuple[Tensor, Tensor]:
     """Find the nearest part of each sweep to where a velocity puts a part of t, and its distance, (H, S) each.
 
-    `of_t` is (H,), and `place` is (2, H, S), finest pixels. In t, the nearest part is the part itself, and the distance
-    is 0. Without a part near, the distance is infinite.
+    `of_t` is (H,), and `expected`, (2, H, S), finest pixels, is where the velocity puts the part. In t, the nearest
+    part is the part itself, and the distance is 0. Without a part near, the distance is infinite.
     """
-    step = torch.arange(place.shape[2], device=of_t.device).expand(place.shape[1:])
+    step = torch.arange(expected.shape[2], device=of_t.device).expand(expected.shape[1:])
     window = parts.window.index_select(0, of_t)[:, None].expand_as(step)
-    part, is_part = cells.around(window, step, place, _NEAR)  # [H, S, 25]
-    square = (_centres(parts, part) - place[..., None]).square_().sum(0).masked_fill_(~is_part, math.inf)
+    part, is_part = cells.around(window, step, expected, _NEAR)  # [H, S, 25]
+    square = (_centres(parts, part) - expected[..., None]).square_().sum(0).masked_fill_(~is_part, math.inf)
     nearest, index = square.min(2)  # [H, S]
     part = part.gather(2, index[..., None])[..., 0]
     part[:, 1] = of_t
