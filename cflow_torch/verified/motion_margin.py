@@ -70,15 +70,11 @@ def motion_margin(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigi
 
 
 def _are_tall(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> Tensor:
-    """Tell which objects with a motion are higher than people and cars (G,) bool."""
-    of_pixel = objects.by_object.where(objects.by_object.spread(rigid.flow.any(1))).of_item  # [P']
-    of_point = sweeps.points.spread(of_pixel[: sweeps.points.count], none=objects.count)
-    of_copy = sweeps.copies.spread(of_pixel, none=objects.count)
-    of_all = Groups(torch.cat((of_point, of_copy)), objects.count)
-    moving = flat_nonzero(of_all.is_member)
-    layer = torch.cat((sweeps.layer, sweeps.layer.index_select(0, sweeps.copied))).index_select(0, moving)
-    lowest, highest = of_all[moving].min(layer, HIGHEST_LAYER), of_all[moving].max(layer, -HIGHEST_LAYER)
-    return highest - lowest >= _LAYERS
+    """Tell which objects with a motion are higher than people and cars, (G,) bool."""
+    row, pixel = sweeps.points_of(objects.by_object.spread(rigid.flow.any(1)))
+    of_point = objects.by_object[pixel]
+    layer = sweeps.layer.index_select(0, row)
+    return of_point.max(layer, -HIGHEST_LAYER) - of_point.min(layer, HIGHEST_LAYER) >= _LAYERS
 
 
 def _margins(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigid: RigidMotion, is_fast: Tensor) -> Tensor:

@@ -127,10 +127,9 @@ class _Map:
     """A map of each sweep with a part in each cell; of several parts, the last one."""
 
     def __init__(self, sweeps: HeightSlicedSweeps, parts: _Parts) -> None:
-        grid = sweeps.grid
-        self._side = max(1, round(_CELL / grid.pixel_size))  # finest pixels
+        self._side = max(1, round(_CELL / sweeps.grid.pixel_size))  # finest pixels
         # A border as wide as the farthest neighbours, so that they need no tests.
-        self._lattice = grid.lattice(self._side, border=_REACH)
+        self._lattice = sweeps.grid.lattice(self._side, border=_REACH)
         self._num_steps = sweeps.num_steps
         num_cells = sweeps.batch.num_windows * sweeps.num_steps * self._lattice.area
         number = torch.arange(1, len(parts) + 1, dtype=torch.int32, device=parts.step.device)
@@ -143,8 +142,7 @@ class _Map:
 
         `centre` is (2, ...), finest pixels, `window` and `step` are (...).
         """
-        square = self._lattice.square(reach, centre.device)[:, 0]
-        cell = self._cell_of(window, step, centre)[..., None] + square
+        cell = self._cell_of(window, step, centre)[..., None] + self._lattice.square(reach, centre.device)[:, 0]
         part = self._part.index_select(0, cell.view(-1)).view_as(cell)
         return (part - 1).clamp_(min=0).long(), part > 0
 
