@@ -122,8 +122,7 @@ class Columns:
         """
         lattice = grid.lattice(border=BORDER)
         device = is_occupied.device
-        square = lattice.square(1, device)
-        is_column = mark(is_occupied, (flat_nonzero(is_occupied) + square).view(-1))
+        is_column = mark(is_occupied, (flat_nonzero(is_occupied) + lattice.square(1, device)).view(-1))
         cell = _inside(is_column, lattice)  # [C]
         for reach in range(2, spacing.most + 1):
             cell = _grow(is_column, cell, grid, spacing, reach)

@@ -57,8 +57,7 @@ def _matched_slices(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor
 
     The counts of objects that are not wanted, (G,) bool, are 0. For t+1, "ahead" is the opposite side.
     """
-    is_wanted = objects.by_object.spread(wanted) & (sweeps.pixels.step < 2)  # [P]
-    index = flat_nonzero(is_wanted)
+    index = flat_nonzero(objects.by_object.spread(wanted) & (sweeps.pixels.step < 2))  # [K]
     of_object = objects.by_object[index]  # [K]
     pixels = sweeps.pixels[index]  # [K]
     sides = (*_AHEAD, *((-row, -col) for row, col in _AHEAD))
