@@ -348,10 +348,6 @@ class Columns:
         dtype = index_dtype(max(len(self.image), 2 * self.slices.numel()), place.device)
         return Pixels(place.to(dtype), drawn.view(-1).index_select(0, entry))
 
-    def window_row_col(self) -> tuple[Tensor, Tensor]:
-        """Return the window of each column, (C + 1,) int64, and its row and column in the image, (2, C + 1) int64."""
-        return self.lattice.split(self.cell)
-
     def fill(self, is_unknown: Tensor) -> None:
         """Set all bits where it is not known what a sweep would have, (C + 1, S) bool.
 

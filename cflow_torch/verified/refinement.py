@@ -259,9 +259,8 @@ class Registration:
         start = torch.cat((start, torch.zeros_like(start[:, :1])), 1).t()  # [3, G]
         motion = start  # x, y and the tangent of half the angle, per sweep interval
         for iteration in range(num_iterations):
-            rigid = self._rigid(motion)
             source = self._sample if iteration < num_iterations // 2 else self._source
-            equations = source.sum_by_object(partial(self._equations, rigid), 9)
+            equations = source.sum_by_object(partial(self._equations, self._rigid(motion)), 9)
             right_side = prior * (start - motion) + equations[6:]  # [3, G]
             change = matvec(full(inverse(held + equations[:6])), right_side)
             motion = torch.add(motion, change, alpha=STEP_LENGTH)
