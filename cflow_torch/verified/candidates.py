@@ -51,13 +51,13 @@ def propose(sweeps: HeightSlicedSweeps, tree: Tree, blocks: Sequence[int], confi
     peak *= boxes.block.index_select(0, pairs.cluster)[:, None]
     estimates = Estimates.of(pairs, peak, score, sweeps.elapsed.index_select(0, tree.window)[:, 1:])
 
-    own = estimates.per_interval().masked_fill_(~estimates.available[:, :, None], 0.0)
+    motion = estimates.per_interval().masked_fill_(~estimates.available[:, :, None], 0.0)
     if sweeps.num_steps > 2:
-        own = torch.cat((masked_median(own, estimates.available)[:, None], own), 1)
-    own = own + 0.0  # turns -0.0 into 0.0
+        motion = torch.cat((masked_median(motion, estimates.available)[:, None], motion), 1)
+    motion = motion + 0.0  # turns -0.0 into 0.0
     # A fast object has no parent: its velocity takes this place.
-    of_parent = tree.by_parent.spread(own[:, 0]) + tree.linked_velocity
-    return Candidates(torch.cat((own, of_parent[:, None]), 1), estimates.newest_score())
+    of_parent = tree.by_parent.spread(motion[:, 0]) + tree.linked_velocity
+    return Candidates(torch.cat((motion, of_parent[:, None]), 1), estimates.newest_score())
 
 
 @dataclass(frozen=True)

@@ -156,21 +156,21 @@ class Columns:
         """
         is_near = draw(column, len(self.cell))
         for reach in range(1, self.most_reach + 1):
-            near = self.cell.index_select(0, flat_nonzero(is_near)) + self.lattice.square(1, column.device)
-            beside = self.image.index_select(0, near.view(-1)).long()
+            around = self.cell.index_select(0, flat_nonzero(is_near)) + self.lattice.square(1, column.device)
+            beside = self.image.index_select(0, around.view(-1)).long()
             if self.reach is not None:  # other windows of the batch may have a larger one
                 beside = beside * (self.reach.index_select(0, beside) >= reach)
             mark(is_near, beside)
         is_near[0] = True  # the empty column stays the first one
-        own = flat_nonzero(is_near)
+        near = flat_nonzero(is_near)
         half = len(self.image) // 2
         copies = replace(
             self,
-            cell=self.cell.index_select(0, own) + half,
-            slices=torch.zeros_like(self.slices[: len(own)]),
-            rank=torch.full_like(self.rank[:, : len(own)], _EMPTY),
-            reach=None if self.reach is None else self.reach.index_select(0, own),
-            tall=None if self.tall is None else flat_nonzero(draw(self.tall, len(self.cell)).index_select(0, own)),
+            cell=self.cell.index_select(0, near) + half,
+            slices=torch.zeros_like(self.slices[: len(near)]),
+            rank=torch.full_like(self.rank[:, : len(near)], _EMPTY),
+            reach=None if self.reach is None else self.reach.index_select(0, near),
+            tall=None if self.tall is None else flat_nonzero(draw(self.tall, len(self.cell)).index_select(0, near)),
         )
         copies._number(1)
         return copies, self.image.index_select(0, self.cell.index_select(0, column) + half).long()
@@ -292,10 +292,10 @@ class Columns:
         around = self._or_within_pixels(words)
         if self.tall is None:
             return around
-        own = around.index_select(0, self.tall)
-        above = own << 1 | own >> (NUM_SLICES - 1)  # the highest slice is below the lowest one
-        below = own >> 1 | own << (NUM_SLICES - 1)
-        return around.index_copy(0, self.tall, own | (above | below) & _OWN_OF_WORD)
+        of_tall = around.index_select(0, self.tall)
+        above = of_tall << 1 | of_tall >> (NUM_SLICES - 1)  # the highest slice is below the lowest one
+        below = of_tall >> 1 | of_tall << (NUM_SLICES - 1)
+        return around.index_copy(0, self.tall, of_tall | (above | below) & _OWN_OF_WORD)
 
     def _or_within_pixels(self, words: Tensor) -> Tensor:
         """Return the slices up to the reach of each column away, (C + 1, W) int64.

@@ -260,9 +260,9 @@ def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: fl
 def _are_alike(sweeps: HeightSlicedSweeps, parts: _Parts, of_t: Tensor, other: Tensor) -> Tensor:
     """Tell which other parts, (..., N, M), are of like size as N parts of t, if the window is a pair. Else all are."""
     size = parts.by_part.size()
-    own = size.index_select(0, of_t)[:, None]
+    size_at_t = size.index_select(0, of_t)[:, None]
     size = size.index_select(0, other.view(-1)).view_as(other)
-    is_like = (size <= _LIKE * own) & (own <= _LIKE * size)
+    is_like = (size <= _LIKE * size_at_t) & (size_at_t <= _LIKE * size)
     return is_like | sweeps.has_history.index_select(0, parts.window.index_select(0, of_t))[:, None]
 
 
