@@ -33,6 +33,7 @@ from cflow_torch.transforms import (
     to_quaternions,
     to_rotations,
     transform_points,
+    turn_of,
 )
 from cflow_torch.types import CFlowWarning
 
@@ -756,10 +757,29 @@ def test_ground_masks_of_other_rows_and_of_all_points_are_recognised(request, so
     assert "empty, but the sweep contains ground" in text
 
 
-def test_poses_of_another_sensor_are_not_taken_for_other_axes_of_the_points(drive):
-    """Poses of LOAM (x left, y up, z forward), next to points with x forward."""
-    (problem,) = find_problems(Wrong(drive, poses=each(lambda pose: pose @ as_matrix(AXES["z_first"].T))))
-    assert "are of the points' frame (else give data.ego_T_lidar)" in problem and "data.read_as" not in problem
+CAMERA_AHEAD = as_matrix(rotations_about(1, np.radians(8)) @ AXES[CAMERA], (1.2, 0.3, 0.4))
+INERTIAL_UNIT = as_matrix(rotations_about(2, np.radians(15)) @ rotations_about(1, np.radians(30)), (0.1, 0.05, -0.2))
+
+
+@pytest.mark.parametrize(
+    ("lidar_T_sensor", "axes"),
+    [
+        (as_matrix(AXES["z_first"].T), "left, up, ahead"),  # as of LOAM
+        (CAMERA_AHEAD, "right, down, ahead"),
+        (INERTIAL_UNIT, "ahead, left, up"),
+    ],
+    ids=["loam", "camera", "imu"],
+)
+def test_poses_of_another_sensor_are_named_with_its_axes_and_place(turning, lidar_T_sensor, axes):
+    """The points are right: nothing may be said of them."""
+    wrong = Wrong(turning, poses=each(lambda pose: pose @ lidar_T_sensor))
+    (problem,) = [text for text in find_problems(wrong) if "ground masks" not in text]
+    assert f"another sensor, whose x, y and z axes point {axes}" in problem and "data.read_as" not in problem
+    rotation = np.array(json.loads(re.search(r"rotation of about (\[\[.*?\]\])", problem)[1]))
+    assert np.degrees(turn_of(rotation @ lidar_T_sensor[:3, :3])) < 5
+    if lidar_T_sensor is CAMERA_AHEAD:
+        place = re.search(r"origin is at about x = (.*) m and y = (.*) m and z = (.*) m in", problem)
+        assert np.abs(np.linalg.inv(lidar_T_sensor)[[0, 2], 3] - (float(place[1]), float(place[3]))).max() < 0.8
 
 
 class Changed(LogWrapper):
