@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import logging
-import warnings
 from collections import Counter
 from dataclasses import replace
 from glob import glob
@@ -213,9 +212,7 @@ def _has_logs(name: str, root: Any) -> bool:
 def _opens(name: str, root: Any) -> bool:
     """Test whether the first log under a path can be opened in a format."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            _open(name, find_sources(name, root)[0], {}).close()
+        _open(name, find_sources(name, root)[0], {}).close()
         return True
     except CFlowError:
         return False

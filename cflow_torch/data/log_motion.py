@@ -160,6 +160,17 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     return judgement
 
 
+def fits_better(log: Log, others: np.ndarray) -> bool:
+    """Test whether the points of a log fit other poses, (K, 4, 4) float64, clearly better than its own."""
+    poses = known_poses(log)
+    prepared = []
+    for first, second in [] if poses is None else choose_pairs(len(log.timestamps), poses):
+        pair = make_pair(log.sweep(first), log.sweep(second), in_world=False)
+        given, other = (np.linalg.inv(each[second]) @ each[first] for each in (np.asarray(poses), others))
+        prepared.append(pair and replace(pair, transforms={GIVEN: given, _OTHER: other}))
+    return _OTHER in judge(prepared).best
+
+
 def _hardly_move(poses: np.ndarray) -> bool:
     """Test whether points 20 m away move by less than 0.1 m in most sweep intervals."""
     first = np.arange(len(poses) - 1)

@@ -418,7 +418,7 @@ def _mounting(rotation: np.ndarray, place: np.ndarray) -> Reading:
         names = [_DIRECTIONS[axis][int(row[axis] < 0)] for row in rotation for axis in [int(np.abs(row).argmax())]]
         causes.append(f"the poses are of another sensor, whose x, y and z axes point {', '.join(names)}")
         fixes.append(f"a rotation of about {(np.round(rotation, 3) + 0.0).tolist()}")
-        where = "data.poses_of=sensor and data.ego_T_lidar, the transform from the LiDAR to it, with"
+        where = "data.ego_T_lidar, the transform from the LiDAR to it (in data=arrays with data.poses_of=sensor), with"
     if place.any():
         named = [f"{axis} = {value:.1f} m" for axis, value in zip("xyz", place) if axis != "z" or abs(value) > 0.05]
         causes.append(f"the points' origin is at about {' and '.join(named)} in the frame of the poses")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cflow_torch import CFlowError, Sweep
-from cflow_torch.data.arrays import write_array_log
+from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.deskewing import DeskewedLog
@@ -755,6 +755,20 @@ def test_ground_masks_of_other_rows_and_of_all_points_are_recognised(request, so
     assert any("no point would have flow" in text for text in find_problems(Wrong(log, masks=np.ones_like)))
     (text,) = [text for text in find_problems(Wrong(log, masks=np.zeros_like)) if "ground" in text]
     assert "empty, but the sweep contains ground" in text
+
+
+def test_poses_of_the_lidar_are_told_from_those_of_the_vehicle(drive, tmp_path):
+    """As who corrects a tilted LiDAR with poses from its own odometry, which the check advises."""
+    tilt = as_matrix(rotations_about(1, np.radians(20)))
+    level = Wrong(drive, points=lambda points, _: transform_points(points, np.linalg.inv(tilt)), masks=False)
+    for name, poses in (("lidar", drive.poses @ tilt), ("ego", drive.poses)):
+        write_array_log(Wrong(level, poses=lambda _, poses=poses: poses, masks=False, name=name), tmp_path)
+        log = ArraysLog(tmp_path / name, ego_T_lidar=tilt)
+        assert np.allclose(log.poses, drive.poses, atol=1e-6)
+        assert any("poses are those of the LiDAR" in note for note in log.notes) == (name == "lidar")
+    sensor = ArraysLog(tmp_path / "ego", ego_T_lidar=tilt, poses_of="sensor")
+    assert np.allclose(sensor.poses, drive.poses @ tilt, atol=1e-6)
+    assert np.allclose(sensor.sweep(3).points, level.sweep(3).points, atol=1e-4), "the points stay"
 
 
 CAMERA_AHEAD = as_matrix(rotations_about(1, np.radians(8)) @ AXES[CAMERA], (1.2, 0.3, 0.4))

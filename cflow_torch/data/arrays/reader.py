@@ -28,6 +28,7 @@ from cflow_torch.data.calibration import CAMERA_KEYS, read_calibration, transfor
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.log import Log
+from cflow_torch.data.log_motion import fits_better
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, read_bytes, read_start, stem_of, suffix_of
 from cflow_torch.data.point_times import find_times
@@ -52,7 +53,8 @@ class ArraysLog(Log):
             folder there whose contents are poses, or VIEWPOINT of `.pcd` files if it is set, or those in arrays of
             each `.npz` file, or the only file of text in a folder near this one that has poses at the unix times of the
             sweeps; None = no poses; or a file (see `read_poses`); or a (K, 4, 4) array.
-        poses_of: "ego" or "lidar", the frame whose poses these are.
+        poses_of: whose poses these are: "ego", "lidar", or "sensor" = of another sensor: `ego_T_lidar` then maps to it,
+            and the points stay. "auto" = of the LiDAR if the static world then stands still clearly better, else "ego".
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
         times: "auto" = times.txt in the folder, or see `timestamps`; None = none; or a file with one time per sweep.
@@ -87,7 +89,7 @@ class ArraysLog(Log):
         self,
         folder: PathLike,
         poses: Any = "auto",
-        poses_of: str = "ego",
+        poses_of: str = "auto",
         calibration: PathLike | None = "auto",
         times: PathLike | None = "auto",
         ground: PathLike | None = "auto",
@@ -96,8 +98,8 @@ class ArraysLog(Log):
         bin_columns: int | str = "auto",
     ) -> None:
         self.folder = as_path(folder)
-        if poses_of not in ("ego", "lidar"):
-            raise CFlowError(f"poses_of={poses_of!r}: pass 'ego' or 'lidar'")
+        if poses_of not in ("auto", "ego", "lidar", "sensor"):
+            raise CFlowError(f"poses_of={poses_of!r}: pass 'auto', 'ego', 'lidar' or 'sensor'")
         if bin_columns != "auto" and (type(bin_columns) is not int or bin_columns < 3):
             raise CFlowError(f"bin_columns={bin_columns!r}: pass 'auto' or an integer of at least 3")
         self.log_id = self.folder.resolve().name
@@ -122,9 +124,18 @@ class ArraysLog(Log):
             self._note(f"the times of its sweeps are those of {file_of_times.name}")
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
+        lidar_T_ego = np.linalg.inv(self.ego_T_lidar)
         if trajectory is not None and (are_of_lidar or poses_of == "lidar"):
-            trajectory = trajectory._replace(poses=trajectory.poses @ np.linalg.inv(self.ego_T_lidar))
+            trajectory = trajectory.seen_from(lidar_T_ego)
+        elif trajectory is not None and poses_of == "sensor":
+            trajectory = trajectory.seen_from(self.ego_T_lidar)
+            self.ego_T_lidar = np.eye(4)
         self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
+        is_open = poses_of == "auto" and not are_of_lidar and self.poses is not None
+        if is_open and ego_T_lidar is not None and fits_better(self, self.poses @ lidar_T_ego):
+            self._note("its poses are those of the LiDAR. data.poses_of=lidar does the same without this line")
+            self.poses = self.poses @ lidar_T_ego
+            self.trajectory = self.trajectory and (self.trajectory[0], self.trajectory[1] @ lidar_T_ego)
         self.gaps |= frozenset(self._gaps_in_numbers())
         self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAYS))
         if trajectory is not None and self.has_viewpoints:
