@@ -111,12 +111,12 @@ class ArraysLog(Log):
             self._note(f"we read the clouds in {self.files[0].parent.name}; there are others in {', '.join(others)}")
         self._ground = resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
-        self.lidar_position = self.ego_T_lidar[:3, 3]
+        self.lidar_position = np.zeros(3) if poses_of == "sensor" else self.ego_T_lidar[:3, 3]
         stated, file_of_times = self._stated_times(times), None
         stamps = stated
         if stated is None and times == "auto":
             stamps, file_of_times = self._tabled_times()
-        trajectory, are_of_lidar = self._trajectory(poses, calibration, stamps)
+        trajectory, poses_of = self._trajectory(poses, poses_of, calibration, stamps)
         counted = None if trajectory is None else trajectory.counted(stated).times_ns
         if stated is None and counted is not None and len(counted) == len(self.files):
             stamps = counted.tolist()
@@ -124,18 +124,9 @@ class ArraysLog(Log):
             self._note(f"the times of its sweeps are those of {file_of_times.name}")
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
-        lidar_T_ego = np.linalg.inv(self.ego_T_lidar)
-        if trajectory is not None and (are_of_lidar or poses_of == "lidar"):
-            trajectory = trajectory.seen_from(lidar_T_ego)
-        elif trajectory is not None and poses_of == "sensor":
-            trajectory = trajectory.seen_from(self.ego_T_lidar)
-            self.ego_T_lidar = np.eye(4)
-        self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
-        is_open = poses_of == "auto" and not are_of_lidar and self.poses is not None
-        if is_open and ego_T_lidar is not None and fits_better(self, self.poses @ lidar_T_ego):
-            self._note("its poses are those of the LiDAR. data.poses_of=lidar does the same without this line")
-            self.poses = self.poses @ lidar_T_ego
-            self.trajectory = self.trajectory and (self.trajectory[0], self.trajectory[1] @ lidar_T_ego)
+        self.poses = None if trajectory is None else self._pose_per_sweep(self._of_ego(trajectory, poses_of), stamps)
+        if poses_of == "auto" and ego_T_lidar is not None and self.poses is not None:
+            self._ask_whose_poses()
         self.gaps |= frozenset(self._gaps_in_numbers())
         self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAYS))
         if trajectory is not None and self.has_viewpoints:
@@ -187,10 +178,12 @@ class ArraysLog(Log):
             self._note(f"its .bin files look like {layout}; data.bin_columns sets another number")
         return layout
 
-    def _trajectory(self, poses: Any, calibration: Any, stamps: Sequence[int] | None) -> tuple[Trajectory | None, bool]:
-        """Return the poses, and whether a calibration converted them to the LiDAR's."""
+    def _trajectory(
+        self, poses: Any, poses_of: str, calibration: Any, stamps: Sequence[int] | None
+    ) -> tuple[Trajectory | None, str]:
+        """Return the poses, and whose they are: of the LiDAR if a calibration converted them, else as given."""
         if poses is not None and not is_path_like(poses):
-            return Trajectory(checked_poses(np.asarray(poses), "poses"), None, False, "poses"), False
+            return Trajectory(checked_poses(np.asarray(poses), "poses"), None, False, "poses"), poses_of
         if poses == "auto":
             found = find_poses(self.folder, self.files, stamps, partial(self._fits, stamps), self._note)
             trajectory = found or self._viewpoints()
@@ -198,15 +191,15 @@ class ArraysLog(Log):
             file = resolve(self.folder, poses, (), "poses")
             trajectory = None if file is None else poses_text.read_poses(file)
         if trajectory is None:
-            return None, False
+            return None, poses_of
         chosen = resolve(self.folder, calibration, ("calib.txt",), "calibration")
         if chosen is None or (calibration == "auto" and not trajectory.is_kitti):
-            return trajectory, False
+            return trajectory, poses_of
         values = read_calibration(chosen)
         if calibration == "auto" and values.keys().isdisjoint(CAMERA_KEYS):
             fix = "if they are KITTI's poses of a camera, download data_odometry_calib.zip, which has it"
             self._note(f"{chosen.name} has no Tr, so we take the poses for those of the LiDAR: {fix}")
-            return trajectory, False
+            return trajectory, poses_of
         T_cam_lidar = transform(values, chosen, *CAMERA_KEYS)
         converted = np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar
         if calibration == "auto" and _drives_along_x(trajectory.poses) and not _drives_along_x(converted):
@@ -214,8 +207,26 @@ class ArraysLog(Log):
                 f"{trajectory.source} has poses that drive along x, the LiDAR's axis ahead, not along z, the camera's. "
                 f"So we take them for poses of the LiDAR, and ignore Tr of {chosen.name}"
             )
-            return trajectory, True
-        return trajectory._replace(poses=converted), True
+            return trajectory, "lidar"
+        return trajectory._replace(poses=converted), "lidar"
+
+    def _of_ego(self, trajectory: Trajectory, poses_of: str) -> Trajectory:
+        """Return the poses of the ego frame. If poses are of another sensor, it is the LiDAR's."""
+        if poses_of == "lidar":
+            return trajectory.seen_from(np.linalg.inv(self.ego_T_lidar))
+        if poses_of == "sensor":
+            trajectory = trajectory.seen_from(self.ego_T_lidar)
+            self.ego_T_lidar = np.eye(4)
+        return trajectory
+
+    def _ask_whose_poses(self) -> None:
+        """Take the poses for those of the LiDAR if the static world then stands still clearly better."""
+        lidar_T_ego = np.linalg.inv(self.ego_T_lidar)
+        others = np.asarray(self.poses) @ lidar_T_ego
+        if fits_better(self, others):
+            self._note("its poses are those of the LiDAR. data.poses_of=lidar does the same without this line")
+            self.poses = others
+            self.trajectory = self.trajectory and (self.trajectory[0], self.trajectory[1] @ lidar_T_ego)
 
     def _fits(self, stamps: Sequence[int] | None, trajectory: Trajectory) -> bool:
         """Test whether poses may be those of the sweeps: by their times, their labels or their number."""
