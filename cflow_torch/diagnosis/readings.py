@@ -321,8 +321,8 @@ def _is_small(name: str) -> bool:
 def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Reading], list[Pair]]:
     """Compare the motions of the poses with those under which the points fit.
 
-    They may be turned by an angle, also if the LiDAR is elsewhere; turns by nearly a multiple of 90 degrees alone are
-    left out, because such readings have names. They may be longer or shorter. Or each pair has another small error.
+    They may be of a frame that is turned, and elsewhere, unless such a reading has a name. They may be longer or
+    shorter. Or each pair has another small error.
 
     Returns:
         These readings, and the pairs with those of them that each shows.

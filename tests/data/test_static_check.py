@@ -37,8 +37,6 @@ from cflow_torch.transforms import (
 )
 from cflow_torch.types import CFlowWarning
 
-MOUNTING = as_matrix(np.eye(3), (1.35, 0, 1.6))
-
 
 class Wrong(Log):
     """A log with other points, poses, masks or order of sweeps. `points` is called with the points and the pose."""
@@ -343,13 +341,14 @@ def test_poses_of_another_log_are_named(drive):
     assert judge_log(mixed).best == (NO_READING,) and "no reading" in find_problems(mixed)[0]
 
 
-@pytest.mark.parametrize("source", ["drive", "real"])
-def test_a_lidar_elsewhere_on_the_vehicle_shows_in_turns(source, request):
-    mixed = Wrong(request.getfixturevalue(source), poses=each(lambda pose: pose @ np.linalg.inv(MOUNTING)))
+@pytest.mark.parametrize(("source", "side"), [("drive", 0), ("real", 0), ("drive", 2)])
+def test_a_lidar_elsewhere_on_the_vehicle_shows_in_turns(source, side, request):
+    mounting = as_matrix(np.eye(3), (1.35, side, 1.6))
+    mixed = Wrong(request.getfixturevalue(source), poses=each(lambda pose: pose @ np.linalg.inv(mounting)))
     (place,) = re.findall(
         r"data.ego_T_lidar with a position of about x = (.*) m and y = (.*) m", find_problems(mixed)[0]
     )
-    assert np.hypot(float(place[0]) - 1.35, float(place[1])) < 0.4
+    assert np.hypot(float(place[0]) - 1.35, float(place[1]) - side) < 0.4
 
 
 def test_a_lidar_that_is_turned_and_elsewhere_is_located(turning):

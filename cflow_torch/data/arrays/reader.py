@@ -223,7 +223,11 @@ class ArraysLog(Log):
         """Take the poses for those of the LiDAR if the static world then stands still clearly better."""
         lidar_T_ego = np.linalg.inv(self.ego_T_lidar)
         others = np.asarray(self.poses) @ lidar_T_ego
-        if fits_better(self, others):
+        try:
+            are_of_lidar = fits_better(self, others)
+        except (CFlowError, OSError):  # `sweep` raises the error of the sweep that cannot be read
+            return
+        if are_of_lidar:
             self._note("its poses are those of the LiDAR. data.poses_of=lidar does the same without this line")
             self.poses = others
             self.trajectory = self.trajectory and (self.trajectory[0], self.trajectory[1] @ lidar_T_ego)
