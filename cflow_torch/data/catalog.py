@@ -108,8 +108,10 @@ def recognise(root: Any) -> str:
             level = [path for folder in level for path in visible(folder)]
     found = [name for name in found if _has_logs(name, root)]  # nuScenes and TruckScenes have the same file names
     if found and _has_clouds(marked[0], top):  # folders of other data sets may be called so
-        found = [name for name in found if _opens(name, root)] or ["arrays"] * _opens("arrays", root) or found
-    found = found or ["arrays"] * _has_logs("arrays", root)
+        opened = [name for name in found if _opens(name, root)]
+        found = ["arrays"] if not opened and _opens("arrays", root) else opened or found
+    if not found and _has_logs("arrays", root):
+        found = ["arrays"]
     if len(found) != 1:
         choose = f"choose one with data={'|'.join(DATA_SETS)}"
         fits = f"several formats fit, {' and '.join(found)}; {choose}"

@@ -363,7 +363,8 @@ def _readings_of_motions(pairs: Sequence[Pair], scan: str, motions: Sequence[np.
     elif is_turned:
         rotation = axes if axes[2, 2] == 1 else rotation
         place = _place_of(pairs, scan, rotation)
-        if place.any() or not any(np.array_equal(axes.T, known) for known in AXES.values()):  # else it has a name
+        names = [name for name, known in AXES.items() if name in READINGS and np.array_equal(axes.T, known)]
+        if place.any() or not names:
             found[MOUNTED] = _mounting(rotation, place)
     elif turn_of(rotation) > _SLIGHT:
         is_better = np.linalg.norm(given - fitted @ rotation.T, axis=1) < np.linalg.norm(given - fitted, axis=1)
@@ -388,14 +389,13 @@ def _rotation_between(steps: np.ndarray, motions: np.ndarray, scale: float) -> n
     show, such as the roll on a straight road, stays as it is.
     """
     given, fitted = scale * steps[:, :3, 3], motions[:, :3, 3]
-    turns = [_ARM * np.stack([T[:, 2, 1], T[:, 0, 2], T[:, 1, 0]], 1) for T in (steps, motions)]
-    others = [_ARM * np.stack([T[:, 1, 2], T[:, 2, 0], T[:, 0, 1]], 1) for T in (steps, motions)]
-    turn_given, turn_fitted = (np.subtract(*each) / 2 for each in zip(turns, others))
+    skew = [T[:, :3, :3] - T[:, :3, :3].transpose(0, 2, 1) for T in (steps, motions)]
+    turns = [_ARM / 2 * np.stack([each[:, 2, 1], each[:, 0, 2], each[:, 1, 0]], axis=1) for each in skew]
     levers = np.eye(3) - steps[:, :3, :3]  # [K, 3, 3], times the place of the points is what they change of a step
     place = np.zeros(3)
     for _ in range(_ITERATIONS):
-        target = np.concatenate([given - levers @ place, turn_given, _WEAK * np.eye(3)])
-        source = np.concatenate([fitted, turn_fitted, _WEAK * np.eye(3)])
+        target = np.concatenate([given - levers @ place, turns[0], _WEAK * np.eye(3)])
+        source = np.concatenate([fitted, turns[1], _WEAK * np.eye(3)])
         left, _, right = np.linalg.svd(target.T @ source)
         rotation: np.ndarray = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
         rest = given - fitted @ rotation.T
