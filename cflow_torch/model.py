@@ -19,7 +19,7 @@ from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch, make_batch
 from cflow_torch.windows.memory import split_windows
-from cflow_torch.windows.validation import check_windows
+from cflow_torch.windows.validation import check_windows, keep_nearest
 
 _Model = TypeVar("_Model", bound="SceneFlowModel")
 
@@ -156,6 +156,7 @@ class SceneFlowModel(nn.Module):
     def _estimate(self, windows: Sequence[Window], warns: bool) -> list[FlowResult]:
         """Estimate the flow of every window, see `forward`."""
         check_windows(windows, self.config)
+        windows = [keep_nearest(window, self.config.num_history) for window in windows]
         grid = self.grid(self.config.pixel_sizes[-1])
         device = choose_device(windows, self.device)
         results: list[FlowResult] = []

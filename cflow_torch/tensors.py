@@ -83,7 +83,9 @@ def read_point_times(sweep: Sweep, name: str, interval: float | None, device: to
             f"point times of {name} are not all finite and within {_LONGEST_TIME:g} s of 0: give seconds after the "
             "sweep's time stamp (nanoseconds / 1e9, not a time of day)"
         )
-    return torch.floor(times / interval * _TICKS + 0.5) / _TICKS
+    # A GPU multiplies by the reciprocal of a plain number, which rounds differently.
+    times = times / times.new_full((1,), interval)
+    return torch.floor(times * _TICKS + 0.5) / _TICKS
 
 
 def resolution(dtype: Any, distance: float) -> float:

@@ -43,7 +43,7 @@ class Scene(NamedTuple):
         result, pixels = [], self.sweeps.pixels
         for window in range(self.sweeps.batch.num_windows):
             sweeps = for_oracle(self.sweeps, window)
-            numbers = (pixels.window[self.objects.first] == window).nonzero()[:, 0].tolist()
+            numbers = (self.objects.window == window).nonzero()[:, 0].tolist()
             of_pixel = self.objects.by_object.of_item[pixels.window == window].tolist()
             object_of = np.array([numbers.index(own) if own in numbers else -1 for own in of_pixel], dtype=int)
             result.append((sweeps, object_of, [(x, y) for x, y in self.flow[numbers].tolist()]))
@@ -146,7 +146,7 @@ def _draw(
     _, first_point = np.unique(sweeps.points.of_item.numpy(), return_index=True)
     of_pixel = number_of_point[inside.numpy()][first_point]
     name = Groups(torch.from_numpy(np.where(of_pixel < 0, len(flows), of_pixel)), len(flows))
-    objects = number_objects(name, len(flows))
+    objects = number_objects(sweeps, name, len(flows))
     flow = np.array(flows, dtype=np.float64).reshape(-1, 2)[objects.by_node.of_item.numpy()]
     return Scene(sweeps, objects, torch.from_numpy(flow))
 

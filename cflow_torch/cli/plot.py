@@ -81,7 +81,7 @@ def _draw(cfg: Plot, model: SceneFlowModel, log: Log, pair: int, sweeps: Window)
 def _from_above(cfg: Plot, model: SceneFlowModel, log: Log, pair: int, sweeps: Window) -> Any:
     points, (result,) = sweeps.pc0.points, model([sweeps])
     if cfg.deskew:
-        points = deskew_objects(sweeps, result).cpu()
+        points = deskew_objects(sweeps, result, model.config.sweep_interval).cpu()
     view: dict[str, Any] = {
         "is_ground": sweeps.pc0.is_ground,
         "point_cloud_range": model.config.point_cloud_range,

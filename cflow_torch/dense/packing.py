@@ -23,7 +23,8 @@ from torch import Tensor
 
 from cflow_torch.dense.templates import TemplatePairs
 from cflow_torch.ops.cross_correlation import FAST_LENGTHS
-from cflow_torch.ops.indices import draw, scatter_count, take_columns
+from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.indices import draw, take_columns
 from cflow_torch.types import CFlowError, as_numpy
 from cflow_torch.windows.bev_grid import LONGEST_SIDE
 from cflow_torch.windows.memory import require_memory
@@ -121,7 +122,7 @@ def pack(pairs: TemplatePairs) -> Packing:
     device = pairs.size.device
     num_pairs = len(pairs.cluster)
     image_of_pixel = torch.cat((pairs.template.image, pairs.target.image + num_pairs))
-    energy = scatter_count(image_of_pixel, num_pairs + len(pairs.size))
+    energy = Groups(image_of_pixel, num_pairs + len(pairs.size)).size()
     numbers = _Numbers.of(pairs, energy)
     shapes = _Shapes.of(numbers, _LINES_CPU if device.type == "cpu" else _LINES_GPU)
     _check_size(numbers, shapes, device)

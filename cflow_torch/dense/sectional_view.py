@@ -14,7 +14,7 @@ from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
 from cflow_torch.dense.correlation import Estimates, best_shifts
 from cflow_torch.dense.templates import Images, TemplatePairs
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import concat_ranges, flat_nonzero, renumber
+from cflow_torch.ops.indices import concat_ranges, divide, flat_nonzero, renumber
 
 
 def add_sectional_view(
@@ -127,9 +127,7 @@ def _project(positions: Tensor, heading: Tensor, pixel_size: float) -> Tensor:
     """Rotate points, (3, K), by minus the heading and apply Eq. 3d_to_bev to (x', z): row and column, (2, K) int64."""
     x, y, z = positions
     along = heading[0] * x + heading[1] * y
-    # A tensor, because a GPU multiplies by the reciprocal of a plain number, which rounds differently.
-    side = torch.full((), pixel_size, dtype=z.dtype, device=z.device)
-    return torch.floor(torch.stack((z, along)) / side).long()
+    return divide(torch.stack((z, along)), pixel_size).floor().long()
 
 
 def _draw(pair: Tensor, row_col: Tensor, size: Tensor) -> Images:

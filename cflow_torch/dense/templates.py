@@ -55,7 +55,7 @@ def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float | Tensor, max
     radius = None
     if max_speed is not None:
         seconds = batch.seconds[clusters.window[cluster], source + 1].abs()
-        # A GPU multiplies by the reciprocal of a plain number, which rounds differently.
+        # A tensor in both cases, see `divide`.
         side = pixel_size[cluster] if isinstance(pixel_size, Tensor) else torch.full_like(seconds, pixel_size)
         radius = max_speed * seconds / side + 1  # one for rounding
     return TemplatePairs(

@@ -54,13 +54,14 @@ class GroundHeights:
         height.div_(count.clamp(min=1), rounding_mode="floor")
         return height.masked_fill_(count < _FEWEST_POINTS, _UNKNOWN)
 
-    def at(self, positions: Tensor, window: int | Tensor, mean: Tensor) -> Tensor:
-        """Return the height of the ground around each position, (N,) float64, centimetres.
+    def at(self, positions: Tensor, window: int | Tensor, heights: Tensor) -> Tensor:
+        """Return the height of the block of each position, (N,) float64, centimetres.
 
-        Positions are (3, N), metres, in the region; `window` is (N,) or one number. `mean` is what `mean()` returns.
+        Positions are (3, N), metres, in the region; `window` is (N,) or one number. `heights` has one of each block, as
+        `mean()` returns them.
         """
-        block = self._block(positions, window).clamp_(0, mean.numel() - 1)
-        return mean.view(-1).double().index_select(0, block)
+        block = self._block(positions, window).clamp_(0, heights.numel() - 1)
+        return heights.view(-1).double().index_select(0, block)
 
     def slopes(self, centre: Tensor, window: Tensor) -> Tensor:
         """Return the slopes of the ground around objects, (G, 2) float64, metres of height per metre in x and in y.

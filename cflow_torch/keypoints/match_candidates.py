@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.config import KeypointsConfig
-from cflow_torch.ops.indices import concat_ranges, flat_nonzero, index_in_group, split_index
+from cflow_torch.ops.indices import concat_ranges, divide, flat_nonzero, index_in_group, split_index
 from cflow_torch.ops.morphology import erode_cross
 from cflow_torch.windows.collation import Batch
 
@@ -113,11 +113,10 @@ def describe_keypoints(images: Tensor, patch_size: int) -> KeyPoints:
 def match_radius(batch: Batch, pixel_size: float, config: KeypointsConfig) -> Tensor:
     """(B,) float64, pixels: longest distance of a match in each window, by `gate_radius` and `max_speed`."""
     seconds = batch.seconds[:, 1]
-    size = torch.full_like(seconds, pixel_size)  # a GPU would multiply by the reciprocal of a Python number
-    gate = config.gate_radius * (seconds / torch.full_like(seconds, _GATE_SECONDS)) / size
+    gate = divide(config.gate_radius * divide(seconds, _GATE_SECONDS), pixel_size)
     if config.max_speed is None:
         return gate
-    return torch.minimum(gate, config.max_speed * seconds / size + 1)
+    return torch.minimum(gate, divide(config.max_speed * seconds, pixel_size) + 1)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Operations on index tensors: select, look up, count, renumber, divide."""
+"""Operations on index tensors: select, look up, renumber, divide."""
 
 from __future__ import annotations
 
@@ -43,24 +43,6 @@ def nonzero_pairs(mask: Tensor) -> tuple[Tensor, Tensor]:
 def gather(index: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
     """Select the same elements of several tensors: (K, ...) of (N, ...) each, by (K,) int64 indices."""
     return tuple(values.index_select(0, index) for values in tensors)
-
-
-def scatter_count(index: Tensor, size: int, weights: Tensor | None = None) -> Tensor:
-    """Count how often each index occurs, or sum its weights.
-
-    Args:
-        index: (N,) int64, 0 ... size - 1.
-        size: S.
-        weights: (N,) or (R, N) numbers; None = 1 each.
-
-    Returns:
-        (S,) int64, or (S,) or (R, S) in the dtype of the weights.
-
-    Cost: one pass, without a synchronisation (`torch.bincount` has one).
-    """
-    weights = torch.ones_like(index) if weights is None else weights
-    sums = weights.new_zeros((*weights.shape[:-1], size))
-    return sums.scatter_add_(-1, index.expand_as(weights), weights)
 
 
 def renumber(index: Tensor, size: int) -> Tensor:
@@ -169,6 +151,14 @@ def floor_divide(index: Tensor, divisor: int) -> Tensor:
     if index.device.type == "cpu":
         return torch.from_numpy(np.asarray(index.numpy() // divisor))  # asarray, because 0-d arrays become numbers
     return torch.div(index, divisor, rounding_mode="floor")
+
+
+def divide(values: Tensor, number: float) -> Tensor:
+    """`values / number`, (...) floats, with the same bits on every device.
+
+    The divisor is a tensor, because a GPU multiplies by the reciprocal of a plain number, which rounds differently.
+    """
+    return values / constant((number,), values.dtype, values.device)
 
 
 def split_index(index: Tensor, width: int) -> tuple[Tensor, Tensor]:

@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import concat_ranges, draw, scatter_count, take_columns
+from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.indices import concat_ranges, draw, take_columns
 
 
 class WindowCounts:
@@ -33,7 +34,7 @@ class WindowCounts:
         # Number of pixels above every row, then to the left of every column, of all images. Each image has one line
         # more than rows or columns. We count through all images, because differences are all that we need.
         line = torch.stack((row, col)) + take_columns(self._first_line, image) + 1
-        self._num_before = scatter_count(line.flatten(), int(lines.sum())).cumsum(0)
+        self._num_before = Groups(line.flatten(), int(lines.sum())).size().cumsum(0)
         self.energy = energy
         # Number of pixels so far, in raster order. A row of W pixels has W + 1 entries:
         #

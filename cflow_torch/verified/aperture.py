@@ -65,11 +65,10 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, pixels: Pixels, groups: Grou
     # The window of each component; components without pixels at t+1 are not lines.
     window = at_newest.max(newest_pixels.window, empty=0)
     of_line = flat_nonzero(groups.spread(lines.is_line))  # few pixels
-    pixels_of_lines = pixels[of_line]
     of_newest_line = flat_nonzero(at_newest.spread(lines.is_line))
     is_covered = are_covered(sweeps, newest_pixels[of_newest_line], at_newest[of_newest_line])
     # In a pair, a wall that is visible between two occluders has such ends. With history, the static test excludes it.
-    travels = both_ends_move(sweeps, pixels_of_lines, groups[of_line]) & sweeps.has_history[window]
+    travels = both_ends_move(sweeps, pixels[of_line], groups[of_line]) & sweeps.has_history[window]
     num_more = at_newest.sum(count_slices(newest_pixels.slices) - _TALL)
     is_rail = (num_more < 0) & (lines.variance >= (_RAIL / pixel_size) ** 2)
     slides = lines.is_line & (is_rail | is_covered & ~travels)

@@ -33,7 +33,7 @@ class Candidates(NamedTuple):
     score: Tensor  # (N,) float32, NCC with the nearest sweep in which the node has pixels
 
 
-def propose(nodes: Tree, blocks: Sequence[int], sweeps: HeightSlicedSweeps, config: VerifiedConfig) -> Candidates:
+def propose(sweeps: HeightSlicedSweeps, tree: Tree, blocks: Sequence[int], config: VerifiedConfig) -> Candidates:
     """Return the candidates of all nodes, each correlated at its own pixel size.
 
     Convention: a peak at shift 0 is not refined. The parabola is fitted to counts of slices of the node's own pixels.
@@ -42,22 +42,22 @@ def propose(nodes: Tree, blocks: Sequence[int], sweeps: HeightSlicedSweeps, conf
 
     Source: adapted from Sec. leverage_past_pcs, which takes the medians of magnitude and of orientation.
     """
-    images = _NodeImages.of(nodes, blocks, sweeps)
+    images = _NodeImages.of(sweeps, tree, blocks)
     boxes = images.boxes
-    clusters = Clusters(nodes.window, boxes.top_left, boxes.size, images.pixels)
+    clusters = Clusters(tree.window, boxes.top_left, boxes.size, images.pixels)
     pairs = make_pairs(clusters, sweeps.batch, boxes.block.double() * sweeps.grid.pixel_size, config.max_speed)
     shift, score = best_shifts(pairs, config.correlation, config.max_memory)
     peak = shift + _parabola(images, pairs, shift)
     peak *= boxes.block.index_select(0, pairs.cluster)[:, None]
-    estimates = Estimates.of(pairs, peak, score, sweeps.elapsed.index_select(0, nodes.window)[:, 1:])
+    estimates = Estimates.of(pairs, peak, score, sweeps.elapsed.index_select(0, tree.window)[:, 1:])
 
-    own = estimates.per_interval().masked_fill_(~estimates.available[:, :, None], 0.0)
+    motion = estimates.per_interval().masked_fill_(~estimates.available[:, :, None], 0.0)
     if sweeps.num_steps > 2:
-        own = torch.cat((masked_median(own, estimates.available)[:, None], own), 1)
-    own = own + 0.0  # turns -0.0 into 0.0
+        motion = torch.cat((masked_median(motion, estimates.available)[:, None], motion), 1)
+    motion = motion + 0.0  # turns -0.0 into 0.0
     # A fast object has no parent: its velocity takes this place.
-    of_parent = nodes.by_parent.spread(own[:, 0]) + nodes.linked_velocity
-    return Candidates(torch.cat((own, of_parent[:, None]), 1), estimates.newest_score())
+    of_parent = tree.by_parent.spread(motion[:, 0]) + tree.linked_velocity
+    return Candidates(torch.cat((motion, of_parent[:, None]), 1), estimates.newest_score())
 
 
 @dataclass(frozen=True)
@@ -113,11 +113,11 @@ class _NodeImages:
     slices_of_pixel: Tensor  # (Q,) uint8
 
     @classmethod
-    def of(cls, nodes: Tree, blocks: Sequence[int], sweeps: HeightSlicedSweeps) -> _NodeImages:
+    def of(cls, sweeps: HeightSlicedSweeps, tree: Tree, blocks: Sequence[int]) -> _NodeImages:
         """Draw the nodes. At coarser scales, all slices of a pixel are set."""
-        node = nodes.members.of_item  # [A]
-        members = sweeps.pixels[nodes.pixel]  # [A]
-        boxes = _boxes(nodes, members, blocks, sweeps.num_steps)
+        node = tree.members.of_item  # [A]
+        members = sweeps.pixels[tree.pixel]  # [A]
+        boxes = _boxes(tree, members, blocks, sweeps.num_steps)
         of_member = boxes[node]  # [A]
         row_col = torch.div(members.row_col, of_member.block, rounding_mode="floor")  # [2, A]
         sample = of_member.sample_at(members.step, row_col)  # [A]
@@ -144,26 +144,26 @@ class _NodeImages:
         return self.slices.index_select(0, sample.view(-1)).view_as(sample) * is_inside
 
 
-def _boxes(nodes: Tree, members: Pixels, blocks: Sequence[int], num_steps: int) -> _Boxes:
+def _boxes(tree: Tree, members: Pixels, blocks: Sequence[int], num_steps: int) -> _Boxes:
     """Choose the scale and the box of each node.
 
     Convention: a node has the scale of its level, unless its box has more than `_LARGEST_BOX` pixels there. Then it has
         the finest scale at which the box fits, or the coarsest if it fits nowhere.
     """
     block = constant(tuple(blocks), torch.int64, members.step.device)[:, None]  # [scales, 1], coarse to fine
-    first = nodes.members.min(members.row_col, empty=FAR)  # [2, N], finest pixels
-    last = nodes.members.max(members.row_col, empty=0)
+    first = tree.members.min(members.row_col, empty=FAR)  # [2, N], finest pixels
+    last = tree.members.max(members.row_col, empty=0)
     top_left = torch.div(first[:, None], block, rounding_mode="floor")  # [2, scales, N]
     size = torch.div(last[:, None], block, rounding_mode="floor") - top_left + 1
     num_fitting = (size.prod(0) <= _LARGEST_BOX).sum(0)  # these scales come first
-    scale = torch.minimum(nodes.kind.clamp(max=len(blocks) - 1), (num_fitting - 1).clamp(min=0))
-    node = torch.arange(nodes.count, device=scale.device)
+    scale = torch.minimum(tree.kind.clamp(max=len(blocks) - 1), (num_fitting - 1).clamp(min=0))
+    node = torch.arange(tree.count, device=scale.device)
     size = size[:, scale, node]  # [2, N]
     num_samples = size.prod(0) * num_steps
     end = num_samples.cumsum(0)
     return _Boxes(
         table=torch.stack((block[scale, 0], end - num_samples, *top_left[:, scale, node], *size), 1),
-        num_samples=int(end[-1]) if nodes.count else 0,
+        num_samples=int(end[-1]) if tree.count else 0,
     )
 
 

@@ -1,7 +1,7 @@
-"""Columns: the height slices of all sweeps of a window, at each position that any of them occupies or is next to.
+"""Columns: the height slices of all sweeps of a window, at each place that any of them occupies or is next to.
 
 Most of a bird's-eye view is empty, so a dense image of every sweep is slow to make and to read. One dense image per
-window tells which column is at a position, and small tables have a row for each column.
+window tells which column is at a place, and small tables have a row for each column.
 """
 
 from __future__ import annotations
@@ -19,15 +19,13 @@ from cflow_torch.ops.indices import (
     draw,
     flat_nonzero,
     floor_divide,
-    gather,
     index_dtype,
     lazy_zeros,
     mark,
     nonzero_pairs,
-    split_index,
 )
 from cflow_torch.verified.spacing import Spacing
-from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.bev_grid import Grid, Lattice
 
 NUM_SLICES = 4
 OWN = (1 << NUM_SLICES) - 1  # the bits of the pixel itself
@@ -43,15 +41,15 @@ SLICE_HEIGHT = 0.5  # metres
 class Pixels:
     """K occupied pixels of sweeps. Step 0 is sweep t+1, 1 is t, 2 is t-1, ..."""
 
-    # (K, 6) int32 or int64: slot of t+1 at the same position, counted through all columns; position of row 0 and col 0
-    # in the image; window, step, row, col. We keep a row per pixel, because pixels are often selected at random, which
+    # (K, 6) int32 or int64: slot of t+1 at the same place, counted through all columns; cell of row 0 and col 0 in
+    # the image; window, step, row, col. We keep a row per pixel, because pixels are often selected at random, which
     # took a quarter of the time that a row per number took.
     place: Tensor
     slices: Tensor  # (K,) uint8, one bit for each height slice
 
     @cached_property
     def first_slot(self) -> Tensor:
-        """(K,) int64, slot of sweep t+1 at the same position; that of sweep `step` is `step` slots on."""
+        """(K,) int64, slot of sweep t+1 at the same place; that of sweep `step` is `step` slots on."""
         return self.place[:, 0].long()
 
     @cached_property
@@ -85,13 +83,13 @@ class Pixels:
 class Columns:
     """The columns of B windows, and of B windows of copies.
 
-    Only this class and `position_of` know how positions and slots are numbered.
+    `lattice` numbers the cells of images, and only this class knows how slots are numbered.
 
-    The image of a window has an empty border of `BORDER` positions (b), so that only distant positions need a test:
+    The image of a window has an empty border of `BORDER` cells (b), so that only distant cells need a test:
 
         b b b b b b b b
         b b b b b b b b
-        b b 0 1 2 3 b b      0 = no sweep occupies this position or one of the 8 around it
+        b b 0 1 2 3 b b      0 = no sweep occupies this cell or one of the 8 around it
         b b 0 4 5 6 b b      n = column n
         b b b b b b b b
         b b b b b b b b
@@ -108,8 +106,8 @@ class Columns:
     """
 
     grid: Grid  # H rows and W columns, without the border
-    image: Tensor  # (2 B * area,) int32, column at each position; 0 = none
-    position: Tensor  # (C + 1,) int64, flat index into `image` of each column; column 0 is the empty one
+    image: Tensor  # (2 B * area,) int32, column of each cell; 0 = none
+    cell: Tensor  # (C + 1,) int64, cell of each column; column 0 is the empty one
     slices: Tensor  # (C + 1, T) uint8
     rank: Tensor  # (S, C + 1) int32, position of each pixel in the list of pixels; `_EMPTY` = the pixel is empty
     reach: Tensor | None  # (C + 1,) uint8, pixels, see `Spacing`; None = 1 everywhere
@@ -118,27 +116,26 @@ class Columns:
 
     @classmethod
     def at(cls, is_occupied: Tensor, grid: Grid, num_steps: int, spacing: Spacing) -> Columns:
-        """Make empty columns at and around the occupied positions, (B * area,) bool, which this overwrites.
+        """Make empty columns at and around the occupied cells, (B * area,) bool, which this overwrites.
 
         The border must be False.
         """
-        stride = grid.width + 2 * BORDER
+        lattice = grid.lattice(border=BORDER)
         device = is_occupied.device
-        square = _square(1, stride, device)
-        is_column = mark(is_occupied, (flat_nonzero(is_occupied) + square).view(-1))
-        position = _inside(is_column, grid)  # [C]
+        is_column = mark(is_occupied, (flat_nonzero(is_occupied) + lattice.square(1, device)).view(-1))
+        cell = _inside(is_column, lattice)  # [C]
         for reach in range(2, spacing.most + 1):
-            position = _grow(is_column, position, grid, spacing, reach)
+            cell = _grow(is_column, cell, grid, spacing, reach)
         # Column 0 is said to be in the border, in the last place of its second row: it has only border around it.
-        position = torch.cat((constant((2 * stride - 1,), torch.int64, device), position))
-        reach_of, tall = _reach_and_tall(grid, position, spacing)
+        cell = torch.cat((constant((2 * lattice.stride - 1,), torch.int64, device), cell))
+        reach_of, tall = _reach_and_tall(grid, cell, spacing)
         num_slots = _WORD * -(-num_steps // _WORD)
         columns = cls(
             grid=grid,
             image=lazy_zeros(2 * len(is_column), torch.int32, device),
-            position=position,
-            slices=torch.zeros((len(position), num_slots), dtype=torch.uint8, device=device),
-            rank=torch.full((num_steps, len(position)), _EMPTY, dtype=torch.int32, device=device),
+            cell=cell,
+            slices=torch.zeros((len(cell), num_slots), dtype=torch.uint8, device=device),
+            rank=torch.full((num_steps, len(cell)), _EMPTY, dtype=torch.int32, device=device),
             reach=reach_of,
             most_reach=spacing.most,
             tall=tall,
@@ -148,49 +145,52 @@ class Columns:
 
     def _number(self, first: int) -> None:
         """Write the numbers of the columns into the image, beginning with that of column 1."""
-        number = torch.arange(first, first + len(self.position) - 1, dtype=torch.int32, device=self.image.device)
-        self.image.index_copy_(0, self.position[1:], number)
+        number = torch.arange(first, first + len(self.cell) - 1, dtype=torch.int32, device=self.image.device)
+        self.image.index_copy_(0, self.cell[1:], number)
 
     def for_copies(self, column: Tensor) -> tuple[Columns, Tensor]:
-        """Make empty columns for copies of pixels in some columns, (K,) int64, and around these columns.
+        """Make empty columns for copies of pixels in some columns, (K,) int64, and around these, within their reach.
 
         They are at the same places in windows B ... 2 B - 1. `followed_by` appends them to these columns. The second
         result is the column of each copy, (K,) int64.
         """
-        is_near = draw(column, len(self.position))
-        for _ in range(self.most_reach):
-            near = self.position.index_select(0, flat_nonzero(is_near)) + _square(1, self.stride, column.device)
-            mark(is_near, self.image.index_select(0, near.view(-1)).long())
+        is_near = draw(column, len(self.cell))
+        for reach in range(1, self.most_reach + 1):
+            around = self.cell.index_select(0, flat_nonzero(is_near)) + self.lattice.square(1, column.device)
+            beside = self.image.index_select(0, around.view(-1)).long()
+            if self.reach is not None:  # other windows of the batch may have a larger one
+                beside = beside * (self.reach.index_select(0, beside) >= reach)
+            mark(is_near, beside)
         is_near[0] = True  # the empty column stays the first one
-        own = flat_nonzero(is_near)
+        near = flat_nonzero(is_near)
         half = len(self.image) // 2
         copies = replace(
             self,
-            position=self.position.index_select(0, own) + half,
-            slices=torch.zeros_like(self.slices[: len(own)]),
-            rank=torch.full_like(self.rank[:, : len(own)], _EMPTY),
-            reach=None if self.reach is None else self.reach.index_select(0, own),
-            tall=None if self.tall is None else flat_nonzero(draw(self.tall, len(self.position)).index_select(0, own)),
+            cell=self.cell.index_select(0, near) + half,
+            slices=torch.zeros_like(self.slices[: len(near)]),
+            rank=torch.full_like(self.rank[:, : len(near)], _EMPTY),
+            reach=None if self.reach is None else self.reach.index_select(0, near),
+            tall=None if self.tall is None else flat_nonzero(draw(self.tall, len(self.cell)).index_select(0, near)),
         )
         copies._number(1)
-        return copies, self.image.index_select(0, self.position.index_select(0, column) + half).long()
+        return copies, self.image.index_select(0, self.cell.index_select(0, column) + half).long()
 
     def followed_by(self, copies: Columns) -> Columns:
         """Append the columns of copies, which are then numbered after these columns."""
-        copies._number(len(self.position))
+        copies._number(len(self.cell))
         return replace(
             self,
-            position=torch.cat((self.position, copies.position[1:])),
+            cell=torch.cat((self.cell, copies.cell[1:])),
             slices=torch.cat((self.slices, copies.slices[1:])),
             rank=torch.cat((self.rank, copies.rank[:, 1:]), 1),
             reach=None if self.reach is None or copies.reach is None else torch.cat((self.reach, copies.reach[1:])),
             tall=None,
         )
 
-    @property
-    def stride(self) -> int:
-        """Positions from a row of an image to the next one."""
-        return self.grid.width + 2 * BORDER
+    @cached_property
+    def lattice(self) -> Lattice:
+        """Numbers the cells of the images."""
+        return self.grid.lattice(border=BORDER)
 
     @property
     def num_slots(self) -> int:
@@ -215,10 +215,10 @@ class Columns:
         return self.slices.view(-1).index_select(0, index.view(-1)).view_as(index)
 
     def _column_at(self, pixels: Pixels, shift: Tensor) -> Tensor:
-        """Return the column at the positions that are `shift` away, (K, C) int32."""
-        # These lines take 3 % of a window, so they are in place, and in 32 bits unless there are too many positions.
+        """Return the column of the cells that are `shift` away, (K, C) int32."""
+        # These lines take 3 % of a window, so they are in place, and in 32 bits unless there are too many cells.
         _, start, _, _, row, col = pixels.place[..., None].unbind(1)  # [K, 1] each
-        index = (row + shift[..., 0]).clamp_(-1, self.grid.height).mul_(self.stride)  # [K, C]
+        index = (row + shift[..., 0]).clamp_(-1, self.grid.height).mul_(self.lattice.stride)  # [K, C]
         index += (col + shift[..., 1]).clamp_(-1, self.grid.width)
         index += start
         return self.image.index_select(0, index.view(-1)).view_as(index)
@@ -240,7 +240,7 @@ class Columns:
         return floor_divide(pixels.first_slot, self.num_slots)
 
     def words(self, pixels: Pixels) -> Tensor:
-        """Return the bytes of all sweeps at the same position as each pixel, a byte for each slot: (K, words) int64."""
+        """Return the bytes of all sweeps at the same place as each pixel, a byte for each slot: (K, words) int64."""
         return self.slices.view(torch.int64).index_select(0, self.column_of(pixels))
 
     def around(self, pixels: Pixels, reach: int, count: int) -> Groups:
@@ -250,9 +250,9 @@ class Columns:
         (2 reach + 1)^2 K items, grouped by the pixel of the list.
         """
         column = self.column_of(pixels)
-        position = self.position.index_select(0, column) + _square(reach, self.stride, column.device)
-        around = self.image.index_select(0, position.view(-1)).view_as(position)  # [(2 reach + 1)^2, K]
-        return self.pixel_at((around + pixels.step * len(self.position)).view(-1), count)
+        cell = self.cell.index_select(0, column) + self.lattice.square(reach, column.device)
+        beside = self.image.index_select(0, cell.view(-1)).view_as(cell)  # [(2 reach + 1)^2, K]
+        return self.pixel_at((beside + pixels.step * len(self.cell)).view(-1), count)
 
     def pixel_at(self, entry: Tensor, count: int) -> Groups:
         """Group K entries of `rank`, step * (C + 1) + column, (K,), by their pixel, one of `count` in the list."""
@@ -292,10 +292,10 @@ class Columns:
         around = self._or_within_pixels(words)
         if self.tall is None:
             return around
-        own = around.index_select(0, self.tall)
-        above = own << 1 | own >> (NUM_SLICES - 1)  # the highest slice is below the lowest one
-        below = own >> 1 | own << (NUM_SLICES - 1)
-        return around.index_copy(0, self.tall, own | (above | below) & _OWN_OF_WORD)
+        of_tall = around.index_select(0, self.tall)
+        above = of_tall << 1 | of_tall >> (NUM_SLICES - 1)  # the highest slice is below the lowest one
+        below = of_tall >> 1 | of_tall << (NUM_SLICES - 1)
+        return around.index_copy(0, self.tall, of_tall | (above | below) & _OWN_OF_WORD)
 
     def _or_within_pixels(self, words: Tensor) -> Tensor:
         """Return the slices up to the reach of each column away, (C + 1, W) int64.
@@ -308,9 +308,9 @@ class Columns:
             return within
         wide = flat_nonzero(self.reach > 1)  # [K]
         reach_of_wide = self.reach.index_select(0, wide)[:, None]  # [K, 1]
-        place = self.position.index_select(0, wide) + _square(1, self.stride, wide.device)
+        around = self.cell.index_select(0, wide) + self.lattice.square(1, wide.device)
         # The 3 x 3 columns around each one, which is in the middle: [9 K].
-        beside = self.image.index_select(0, place.view(-1))
+        beside = self.image.index_select(0, around.view(-1))
         for reach in range(2, self.most_reach + 1):
             of_beside = within.index_select(0, beside).view(9, -1, words.shape[1])  # [9, K, W]
             wider = reduce(torch.bitwise_or, of_beside.unbind(0))
@@ -320,12 +320,13 @@ class Columns:
     @cached_property
     def _neighbours(self) -> Tensor:
         """(4, C + 1) int32, column to the left and to the right of each column, above and below it; 0 = none."""
-        steps = constant(((-1,), (1,), (-self.stride,), (self.stride,)), torch.int64, self.image.device)
-        beside = self.position + steps
+        stride = self.lattice.stride
+        steps = constant(((-1,), (1,), (-stride,), (stride,)), torch.int64, self.image.device)
+        beside = self.cell + steps
         return self.image.index_select(0, beside.view(-1)).view_as(beside)
 
     def draw(self, slices: Tensor, columns_before: int = 0, pixels_before: int = 0) -> Pixels:
-        """Draw the height slices of sweeps, and list their pixels, in order of window, step and position.
+        """Draw the height slices of sweeps, and list their pixels, in order of step, window, row and column.
 
         Args:
             slices: (C + 1, S) uint8, slices of the pixels themselves; row 0 is 0.
@@ -336,29 +337,21 @@ class Columns:
         self.slices.view(torch.int64).copy_(words | self._or_within_reach(words) << NUM_SLICES)
         drawn = slices.t().contiguous()  # [S, C + 1]
         step, column = nonzero_pairs(drawn.bool())
-        area = num_positions(self.grid, 1)
-        if len(self.image) > 2 * area:  # several windows
-            window = floor_divide(self.position.index_select(0, column), area)
-            step, column = gather(window.sort(stable=True).indices, step, column)
-        entry = step * len(self.position) + column
+        entry = step * len(self.cell) + column
         number = torch.arange(pixels_before, pixels_before + len(entry), dtype=torch.int32, device=entry.device)
         self.rank.view(-1).index_copy_(0, entry, number)
         first_slot = (column + columns_before) * self.num_slots
-        window, row_col = _split(self.grid, self.position.index_select(0, column))
-        start = window * area + BORDER * (self.stride + 1)
+        window, row_col = self.lattice.split(self.cell.index_select(0, column))
+        start = window * self.lattice.area + self.lattice.first
         place = torch.stack((first_slot, start, window, step, *row_col), 1)
         # With copies, there are at most twice as many columns.
         dtype = index_dtype(max(len(self.image), 2 * self.slices.numel()), place.device)
         return Pixels(place.to(dtype), drawn.view(-1).index_select(0, entry))
 
-    def window_row_col(self) -> tuple[Tensor, Tensor]:
-        """Return the window of each column, (C + 1,) int64, and its row and column in the image, (2, C + 1) int64."""
-        return _split(self.grid, self.position)
-
     def fill(self, is_unknown: Tensor) -> None:
         """Set all bits where it is not known what a sweep would have, (C + 1, S) bool.
 
-        There, nothing is missing. A position without a column stays empty. The pixels that are drawn already stay as
+        There, nothing is missing. A cell without a column stays empty. The pixels that are drawn already stay as
         they are.
         """
         filled = self.slices[1:, : is_unknown.shape[1]]
@@ -367,7 +360,7 @@ class Columns:
     def are_filled(self, pixels: Pixels, step: Tensor | int, shift: Tensor | None = None) -> Tensor:
         """Tell where another sweep has slices, but no pixel, see `fill`: bool, with the arguments of `look_up`."""
         has_slices = self.look_up(pixels, step, shift) & OWN > 0
-        first = step * len(self.position)  # entry of `rank`
+        first = step * len(self.cell)  # entry of `rank`
         if shift is None:
             entry = self.column_of(pixels) + first  # [K]
         else:
@@ -375,56 +368,32 @@ class Columns:
         return has_slices & (self.rank.view(-1).index_select(0, entry.view(-1)).view_as(entry) == _EMPTY)
 
 
-def position_of(grid: Grid, window: int | Tensor, row: Tensor, col: Tensor) -> Tensor:
-    """Return the positions of pixels in the images of the windows, (K,) in the dtype of row and column, never 0."""
-    line = row + (window * (grid.height + 2 * BORDER) + BORDER)
-    return line.mul_(grid.width + 2 * BORDER).add_(col).add_(BORDER)
-
-
-def num_positions(grid: Grid, num_windows: int) -> int:
-    """Return the number of positions in the images of B windows, with their borders."""
-    return num_windows * (grid.height + 2 * BORDER) * (grid.width + 2 * BORDER)
-
-
-def _square(reach: int, stride: int, device: torch.device) -> Tensor:
-    """Return what to add to positions for those around, up to `reach` each way, ((2 reach + 1)^2, 1) int64."""
-    line = range(-reach, reach + 1)
-    return constant(tuple((down * stride + right,) for down in line for right in line), torch.int64, device)
-
-
-def _inside(is_column: Tensor, grid: Grid) -> Tensor:
-    """Clear the borders of images, (B * area,) bool, and list the positions that remain, (C,) int64."""
-    images = is_column.view(-1, grid.height + 2 * BORDER, grid.width + 2 * BORDER)
+def _inside(is_column: Tensor, lattice: Lattice) -> Tensor:
+    """Clear the borders of images, (B * area,) bool, and list the cells that remain, (C,) int64."""
+    images = is_column.view(-1, lattice.height + 2 * BORDER, lattice.stride)
     images[:, :BORDER] = images[:, -BORDER:] = False
     images[:, :, :BORDER] = images[:, :, -BORDER:] = False
     return flat_nonzero(is_column)
 
 
-def _grow(is_column: Tensor, position: Tensor, grid: Grid, spacing: Spacing, reach: int) -> Tensor:
-    """Add the positions next to columns where the reach is at least `reach`, and return the positions of all columns.
+def _grow(is_column: Tensor, cell: Tensor, grid: Grid, spacing: Spacing, reach: int) -> Tensor:
+    """Add the cells next to columns where the reach is at least `reach`, and return the cells of all columns.
 
-    `is_column`, (B * area,) bool, which this overwrites, and `position`, (C,) int64, tell the same columns.
+    `is_column`, (B * area,) bool, which this overwrites, and `cell`, (C,) int64, tell the same columns.
     """
     # A neighbour of a column may have this reach although the column itself is nearer.
-    candidates = flat_nonzero(spacing.are_wide(grid, *_split(grid, position), reach, margin=2.0))
-    square = _square(1, grid.width + 2 * BORDER, position.device)
-    around = (position.index_select(0, candidates) + square).view(-1)
-    wide = flat_nonzero(spacing.are_wide(grid, *_split(grid, around), reach))
-    return _inside(mark(is_column, around.index_select(0, wide)), grid)
+    lattice = grid.lattice(border=BORDER)
+    candidates = flat_nonzero(spacing.are_wide(grid, *lattice.split(cell), reach, margin=2.0))
+    around = (cell.index_select(0, candidates) + lattice.square(1, cell.device)).view(-1)
+    wide = flat_nonzero(spacing.are_wide(grid, *lattice.split(around), reach))
+    return _inside(mark(is_column, around.index_select(0, wide)), lattice)
 
 
-def _split(grid: Grid, position: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the window of K positions, (K,) int64, and row and column in its image, (2, K) int64."""
-    line, col = split_index(position, grid.width + 2 * BORDER)
-    window, row = split_index(line, grid.height + 2 * BORDER)
-    return window, torch.stack((row, col)) - BORDER
-
-
-def _reach_and_tall(grid: Grid, position: Tensor, spacing: Spacing) -> tuple[Tensor | None, Tensor | None]:
-    """Return `Columns.reach` and `Columns.tall` of columns at positions, (C + 1,) int64."""
+def _reach_and_tall(grid: Grid, cell: Tensor, spacing: Spacing) -> tuple[Tensor | None, Tensor | None]:
+    """Return `Columns.reach` and `Columns.tall` of columns, from their cells, (C + 1,) int64."""
     if spacing.most == 1 and not spacing.has_tall:
         return None, None
-    window, row_col = _split(grid, position)
+    window, row_col = grid.lattice(border=BORDER).split(cell)
     reach = spacing.reach(grid, window, row_col) if spacing.most > 1 else None
     tall = flat_nonzero(spacing.are_tall(grid, window, row_col, SLICE_HEIGHT)) if spacing.has_tall else None
     return reach, tall

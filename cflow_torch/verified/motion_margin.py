@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import constant, flat_nonzero
+from cflow_torch.ops.indices import constant, divide, flat_nonzero
 from cflow_torch.types import MOVING
 from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.columns import Pixels
@@ -59,7 +59,7 @@ def motion_margin(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigi
     speed = torch.linalg.vector_norm(rigid.flow, dim=1)  # [G], metres per sweep interval
     is_fast = speed >= float(TABLE["fast"])
     is_far = rigid.centre.square().sum(1) >= float(TABLE["far"]) ** 2
-    has_history = sweeps.has_history.index_select(0, objects.window(sweeps))
+    has_history = sweeps.has_history.index_select(0, objects.window)
     margin = _margins(sweeps, tree, objects, rigid, is_fast)
     row = 8 * has_history + 4 * _are_tall(sweeps, objects, rigid) + 2 * is_far + is_fast
     bins = Bins.moving + row * Bins.num_margins + bin_of(margin, TABLE["margin"])
@@ -70,15 +70,11 @@ def motion_margin(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigi
 
 
 def _are_tall(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> Tensor:
-    """Tell which objects with a motion are higher than people and cars (G,) bool."""
-    of_pixel = objects.by_object.where(objects.by_object.spread(rigid.flow.any(1))).of_item  # [P']
-    of_point = sweeps.points.spread(of_pixel[: sweeps.points.count], none=objects.count)
-    of_copy = sweeps.copies.spread(of_pixel, none=objects.count)
-    of_all = Groups(torch.cat((of_point, of_copy)), objects.count)
-    moving = flat_nonzero(of_all.is_member)
-    layer = torch.cat((sweeps.layer, sweeps.layer.index_select(0, sweeps.copied))).index_select(0, moving)
-    lowest, highest = of_all[moving].min(layer, HIGHEST_LAYER), of_all[moving].max(layer, -HIGHEST_LAYER)
-    return highest - lowest >= _LAYERS
+    """Tell which objects with a motion are higher than people and cars, (G,) bool."""
+    row, pixel = sweeps.points_of(objects.by_object.spread(rigid.flow.any(1)))
+    of_point = objects.by_object[pixel]
+    layer = sweeps.layer.index_select(0, row)
+    return of_point.max(layer, -HIGHEST_LAYER) - of_point.min(layer, HIGHEST_LAYER) >= _LAYERS
 
 
 def _margins(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigid: RigidMotion, is_fast: Tensor) -> Tensor:
@@ -92,7 +88,7 @@ def _margins(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigid: Ri
     """
     pixel, of_object = _list_pixels(tree, objects, rigid.flow.any(1))
     pixels = sweeps.pixels[pixel]  # [K]
-    num_others = 1 + sweeps.num_more.index_select(0, objects.window(sweeps))  # [G], sweeps
+    num_others = 1 + sweeps.num_more.index_select(0, objects.window)  # [G], sweeps
     has_history = num_others > 1
     near = _test_with_copies(sweeps, pixels, of_object, rigid)
     surplus = near.surplus()  # [G, 5]
@@ -130,34 +126,30 @@ def _test_with_copies(sweeps: HeightSlicedSweeps, pixels: Pixels, of_object: Gro
     """
     off = _DISPLACEMENT / sweeps.grid.pixel_size
     offsets = constant(((0, 0), (off, 0), (-off, 0), (0, off), (0, -off)), torch.float64, pixels.slices.device)
-    alike = _group_by_motion(sweeps, pixels, of_object.of_item, rigid)
-    near = count_wins(sweeps, pixels, alike.by_motion, alike.motion[:, None] + offsets).near
-    of_group = Groups(alike.by_motion.max(of_object.of_item, empty=0), of_object.count)
+    by_motion, motion = _group_by_motion(sweeps, pixels, of_object.of_item, rigid)
+    near = count_wins(sweeps, pixels, by_motion, motion[:, None] + offsets).near
+    of_group = Groups(by_motion.max(of_object.of_item, empty=0), of_object.count)
     return Counts(of_group.sum(near.won.t()).t(), of_group.sum(near.lost.t()).t())
 
 
-class _PixelsByMotion(NamedTuple):
-    """K pixels of objects in groups that move alike.
+def _group_by_motion(
+    sweeps: HeightSlicedSweeps, pixels: Pixels, which: Tensor, rigid: RigidMotion
+) -> tuple[Groups, Tensor]:
+    """Group K pixels that move alike; `which` is the object of each one, (K,) int64.
 
     The pixels of an object are a group, except those that its rotation displaces by a pixel or more. Each of these is a
-    group of its own, after the G objects.
+    group of its own, after the G objects. The second result is the motion of each group, (number of groups, 2) float64,
+    (y, x), finest pixels per sweep interval.
     """
-
-    by_motion: Groups  # the K pixels
-    motion: Tensor  # (number of groups, 2) float64, (y, x), finest pixels per sweep interval
-
-
-def _group_by_motion(sweeps: HeightSlicedSweeps, pixels: Pixels, which: Tensor, rigid: RigidMotion) -> _PixelsByMotion:
-    """Group K pixels by motion; `which` is the object of each one, (K,) int64."""
     motion = rigid.pixels_per_interval(sweeps.grid.pixel_size)  # [G, 2]
     position = sweeps.grid.centre(pixels.row_col).flip(0)  # [2, K], x and y
     at_t = position + rigid.flow.index_select(0, which).t() * (sweeps.elapsed_of(pixels) - 1)
-    local_motion = rigid.flow_at(which, at_t).flip(1) / sweeps.grid.pixel_size  # [K, 2]
+    local_motion = divide(rigid.flow_at(which, at_t).flip(1), sweeps.grid.pixel_size)  # [K, 2]
     rotation = local_motion - motion.index_select(0, which)
     alone = flat_nonzero((rotation.abs() >= 1).any(1))
     group = which.index_copy(0, alone, torch.arange(len(alone), device=which.device) + len(motion))
     motion = torch.cat((motion, local_motion.index_select(0, alone)))
-    return _PixelsByMotion(Groups(group, len(motion)), motion)
+    return Groups(group, len(motion)), motion
 
 
 def _are_lines(sweeps: HeightSlicedSweeps, pixels: Pixels, of_object: Groups) -> Tensor:

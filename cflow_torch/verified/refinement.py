@@ -44,7 +44,6 @@ from cflow_torch.verified.voxel_centroids import (
     Voxels,
     VoxelSearch,
     covariance_of,
-    pixel_key,
     points_of_objects,
 )
 
@@ -139,7 +138,7 @@ class Source:
     offset: Tensor  # (2, K) float64, metres, x and y from that centre to the voxel
     height: Tensor  # (1, K) float64, metres, z of the voxel
     covariance: Tensor  # (6, K) float64, square metres, of the surface and of the noise, as in ops/linear.py
-    target_start: Tensor  # (K,) int64, number of the first pixel of t+1 of its window, see `pixel_key`
+    target_start: Tensor  # (K,) int64, the cell (`Lattice`) of row 0 and column 0 of t+1 of its window
     target_layers: Tensor  # (3, K) int32, in which we search for the target
     elapsed: Tensor  # (K,) float64, sweep intervals from the voxel to t+1
 
@@ -160,7 +159,6 @@ class Source:
         up = constant(((-1,), (0,), (1,)), torch.int64, voxel.device)
         # The noise of a pair is added here, to its source.
         noise = constant((_NOISE**2, 0.0, 0.0, _NOISE**2, 0.0, _NOISE**2), torch.float64, voxel.device)[:, None]
-        corner = constant(((0,), (0,)), torch.int64, voxel.device)  # row and column of the first pixel
         position = take_columns(voxels.position, voxel)  # [3, K]
         centre = take_columns(centre, by_object.of_item)  # [2, K]
         return cls(
@@ -170,7 +168,7 @@ class Source:
             offset=position[:2] - centre,
             height=position[2:],
             covariance=take_columns(covariance, voxel) + noise,
-            target_start=pixel_key(voxels.grid, window * voxels.num_steps, corner),
+            target_start=window * voxels.num_steps * voxels.lattice.area + voxels.lattice.first,
             target_layers=((voxels.layer.index_select(0, voxel) + up) % NUM_LAYERS).int(),
             elapsed=elapsed[window, voxels.step.index_select(0, voxel)],
         )
@@ -212,12 +210,9 @@ class Source:
 
 @dataclass(frozen=True)
 class Correspondences:
-    """K voxels of the source, each with the nearest voxel of the target, under a motion."""
+    """The nearest voxel of the target of each of the K voxels of a source, under a motion."""
 
-    source: Tensor  # (K,) int64, voxel of the source
     target: Tensor  # (K,) int64, voxel of the target
-    by_object: Groups  # the correspondences, grouped by object
-    elapsed: Tensor  # (K,) float64, sweep intervals from the source to t+1
     arm: Tensor  # (2, K) float64, metres, from the centre of the object at t+1 to the moved voxel
     weight: Tensor  # (K,) float64, 1 = at the same position, 0 = no pair
     pull: Tensor  # (3, K) float64, metres, information times the residual from the moved voxel to the target
@@ -264,9 +259,8 @@ class Registration:
         start = torch.cat((start, torch.zeros_like(start[:, :1])), 1).t()  # [3, G]
         motion = start  # x, y and the tangent of half the angle, per sweep interval
         for iteration in range(num_iterations):
-            rigid = self._rigid(motion)
             source = self._sample if iteration < num_iterations // 2 else self._source
-            equations = source.sum_by_object(partial(self._equations, rigid), 9)
+            equations = source.sum_by_object(partial(self._equations, self._rigid(motion)), 9)
             right_side = prior * (start - motion) + equations[6:]  # [3, G]
             change = matvec(full(inverse(held + equations[:6])), right_side)
             motion = torch.add(motion, change, alpha=STEP_LENGTH)
@@ -278,7 +272,7 @@ class Registration:
 
     def _equations(self, rigid: RigidMotion, source: Source) -> Tensor:
         """Return the normal equations of each voxel of the source, (6 + 3, K) float64."""
-        return _normal_equations(self._correspond(source, rigid))
+        return _normal_equations(self._correspond(source, rigid), source.elapsed)
 
     def _correspond(self, source: Source, rigid: RigidMotion) -> Correspondences:
         """Move the source to t+1, and find the nearest voxels of the target."""
@@ -303,10 +297,7 @@ class Registration:
         # In units of 1 / noise^2: two centroids without surfaces, at distance 0, have the identity as information.
         scale = weight * _NOISE**2
         return Correspondences(
-            source=source.voxel,
             target=target,
-            by_object=source.by_object,
-            elapsed=source.elapsed,
             arm=arm,
             weight=weight,
             pull=pull * scale,
@@ -351,19 +342,20 @@ class Registration:
 
         def times(source: Source) -> Tensor:
             pairs = self._correspond(source, rigid)
-            delay = time.index_select(0, pairs.target) - time.index_select(0, pairs.source)
-            weight = (pairs.information[0, 0] + pairs.information[1, 1]) * pairs.elapsed
-            return weight * torch.stack((pairs.elapsed, delay))
+            delay = time.index_select(0, pairs.target) - time.index_select(0, source.voxel)
+            weight = (pairs.information[0, 0] + pairs.information[1, 1]) * source.elapsed
+            return weight * torch.stack((source.elapsed, delay))
 
         square, late = self._source.sum_by_object(times, 2)
         stretch = torch.where(square > 0, 1 + late / square, 1.0)
         return torch.where(stretch < _LEAST_STRETCH, 1.0, stretch)
 
 
-def _normal_equations(pairs: Correspondences) -> Tensor:
+def _normal_equations(pairs: Correspondences, elapsed: Tensor) -> Tensor:
     """Linearise the residuals of K correspondences. Return the normal equations of each, (6 + 3, K) float64.
 
-    First comes the hessian, then the right side, which is the negative gradient.
+    First comes the hessian, then the right side, which is the negative gradient. `elapsed`, (K,) float64, are the sweep
+    intervals from the source to t+1.
 
     The parameters are x, y and the tangent of half the angle. A change of x or y moves the voxel by the elapsed time, a
     change of the tangent by the elapsed time times `lever`. No parameter changes z.
@@ -378,7 +370,7 @@ def _normal_equations(pairs: Correspondences) -> Tensor:
     force = pairs.pull[:2]
     torque = (lever * force).sum(0, keepdim=True)
     # The hessian is quadratic in the elapsed time, the right side is linear.
-    return torch.cat((hessian * pairs.elapsed, force, torque)) * pairs.elapsed
+    return torch.cat((hessian * elapsed, force, torque)) * elapsed
 
 
 def deskew(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion) -> ObjectPoints:
@@ -396,7 +388,7 @@ def deskew(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion)
     row_col = torch.stack(sweeps.grid.row_col(position)).long()
     moved = replace(points, position=position, place=torch.cat((points.place[:2], row_col)))
 
-    pixel = pixel_key(sweeps.grid, points.window * sweeps.num_steps + points.step, row_col)
+    pixel = sweeps.columns.lattice.cell(points.window * sweeps.num_steps + points.step, *row_col)
     pixel, number = torch.unique(pixel, return_inverse=True)
     pixels = Groups(number, len(pixel))
     first_object = pixels.min(points.object_id, empty=FAR)

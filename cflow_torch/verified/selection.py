@@ -29,20 +29,16 @@ PRICE = 4 * PER_SLICE
 
 @dataclass(frozen=True)
 class Objects:
-    """The selected objects, in order of their first pixel in the list: those of copies come last."""
+    """The selected objects, in order of window and of their first pixel in the list: those of copies come last."""
 
     by_object: Groups  # the P' pixels
     by_node: Groups  # the G objects, by the node whose motion they take; static objects are in no group
-    first: Tensor  # (G,) int64, position of the first pixel of each object in the list
+    window: Tensor  # (G,) int64, window of each object
 
     @property
     def count(self) -> int:
         """Number of objects, G."""
         return self.by_object.count
-
-    def window(self, sweeps: HeightSlicedSweeps) -> Tensor:
-        """(G,) int64, window of each object."""
-        return sweeps.pixels.window[self.first]
 
     def length_at_newest(self, sweeps: HeightSlicedSweeps) -> Tensor:
         """(G,) float64, metres, longer side of the bounding box of the pixels at t+1; 0 without any."""
@@ -83,8 +79,7 @@ def select_objects(
     Cost: a few passes over the nodes for each level, and over the members; the paired test of nodes that may dissent.
     """
     none = tree.count
-    node = torch.arange(none, device=verdict.evidence.device)
-    winner = _winners(tree, node, verdict.evidence, price)
+    winner = _winners(tree, verdict.evidence, price)
     finest = _finest_of_levels(tree, sweeps.num_pixels)  # [P']
     around = _around_changed(tree, winner, finest)
     taken, left = dissent(sweeps, tree, verdict, around, significance, price)
@@ -93,14 +88,11 @@ def select_objects(
     # The key of an object is the number of its node if it moves, else N plus the number of its component.
     static = _keys_of_components(components, none, sweeps.num_pixels)
     key = torch.where(moving < none, moving, static)
-    return number_objects(Groups(key, none + components.count), tree.count)
+    return number_objects(sweeps, Groups(key, none + components.count), none)
 
 
-def _winners(tree: Tree, node: Tensor, evidence: Tensor, price: int) -> Tensor:
-    """Return the coarsest winner among each node and those that contain it, (N,) int64; N = none of them won.
-
-    `node` is the number of each node, 0 ... N - 1.
-    """
+def _winners(tree: Tree, evidence: Tensor, price: int) -> Tensor:
+    """Return the coarsest winner among each node and those that contain it, (N,) int64; N = none of them won."""
     # From the leaves up: the value of the children of each node.
     of_children = torch.zeros_like(evidence)
     for level in range(tree.num_levels - 1, 0, -1):
@@ -108,6 +100,7 @@ def _winners(tree: Tree, node: Tensor, evidence: Tensor, price: int) -> Tensor:
         of_children += tree.by_parent.sum(torch.where(tree.kind == level, value, 0))
 
     # From the roots down: a node follows the coarsest winner that contains it, which has the smallest number.
+    node = torch.arange(tree.count, device=evidence.device)
     winner = torch.where(evidence > of_children, node, tree.count)
     for _ in range(tree.num_levels - 1):
         winner = torch.minimum(winner, tree.by_parent.spread(winner, none=tree.count))
@@ -168,13 +161,16 @@ def _keys_of_components(components: Components, first: int, num_pixels: int) -> 
     return F.pad(first + linked.of_item, (0, num_copies), value=first + components.count)
 
 
-def number_objects(by_key: Groups, num_nodes: int = 0) -> Objects:
-    """Number the objects in order of their first pixel.
+def number_objects(sweeps: HeightSlicedSweeps, by_key: Groups, num_nodes: int = 0) -> Objects:
+    """Number the objects in order of window, and of their first pixel.
 
     `by_key` groups the P' pixels. The first `num_nodes` groups are objects that are nodes, the others are components.
     """
     first = by_key.first()
     used = flat_nonzero(first < len(by_key.of_item))
-    first, order = first[used].sort()
+    first = first[used]
+    window = sweeps.pixels.window[first]
+    order = (window * sweeps.num_pixels + first).argsort()
     used = used[order]
-    return Objects(by_key.select(used), Groups(used.clamp(max=num_nodes), num_nodes), first)
+    by_node = Groups(used.clamp(max=num_nodes), num_nodes)
+    return Objects(by_key.select(used), by_node, window[order])

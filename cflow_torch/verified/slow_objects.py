@@ -38,8 +38,7 @@ def find_slow(sweeps: HeightSlicedSweeps, objects: Objects, flow: Tensor, longes
     """
     if not sweeps.batch.has_pairs:
         return torch.zeros_like(flow)
-    window = objects.window(sweeps)
-    asked = ~(flow.any(1) | sweeps.has_history.index_select(0, window))
+    asked = ~(flow.any(1) | sweeps.has_history.index_select(0, objects.window))
     if longest is not None:
         asked &= objects.length_at_newest(sweeps) <= longest
     only_ahead, only_behind, total = _matched_slices(sweeps, objects, asked)
@@ -58,8 +57,7 @@ def _matched_slices(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor
 
     The counts of objects that are not wanted, (G,) bool, are 0. For t+1, "ahead" is the opposite side.
     """
-    is_wanted = objects.by_object.spread(wanted) & (sweeps.pixels.step < 2)  # [P]
-    index = flat_nonzero(is_wanted)
+    index = flat_nonzero(objects.by_object.spread(wanted) & (sweeps.pixels.step < 2))  # [K]
     of_object = objects.by_object[index]  # [K]
     pixels = sweeps.pixels[index]  # [K]
     sides = (*_AHEAD, *((-row, -col) for row, col in _AHEAD))

@@ -9,14 +9,15 @@ slices above and below count as well.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Callable, NamedTuple
 
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import constant, draw, flat_nonzero, floor_divide, scatter_count, split_index, take_columns
+from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.indices import constant, divide, draw, flat_nonzero, floor_divide, split_index, take_columns
 from cflow_torch.verified.directions import azimuth_bin, elevation_bin
-from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.bev_grid import Grid, Lattice
 from cflow_torch.windows.collation import Batch
 
 # Bins of directions: fine azimuths in rows of a degree of elevation, and fine elevations in columns of azimuth.
@@ -98,29 +99,33 @@ def _median_gaps(batch: Batch) -> tuple[Tensor, Tensor]:
     window = floor_divide(batch.image.index_select(0, far).long(), batch.num_steps)
     azimuth = azimuth_bin(x, y, _AZIMUTHS)
     level = elevation_bin(z, (x * x + y * y).sqrt_(), _LEVELS, _PER_DEGREE)
+    rows = Lattice(_LEVELS // _PER_DEGREE, _AZIMUTHS)  # of a window
+    columns = Lattice(_AZIMUTHS // _PER_COLUMN, _LEVELS)
+    in_row = rows.cell(window, floor_divide(level, _PER_DEGREE), azimuth)
+    in_column = columns.cell(window, floor_divide(azimuth, _PER_COLUMN), level)
+    across = _median_gap(in_row, rows, batch.num_windows, _width_of_azimuth)
+    up = _median_gap(in_column, columns, batch.num_windows, torch.ones_like)
+    return across / _AZIMUTHS, divide(up, 57.3 * _PER_DEGREE)
 
-    row = floor_divide(level, _PER_DEGREE).add_(window, alpha=_LEVELS // _PER_DEGREE)
-    row, azimuth_of_row = _neighbours(row, azimuth, batch.num_windows * _LEVELS // _PER_DEGREE, _AZIMUTHS)
-    column = floor_divide(azimuth, _PER_COLUMN).add_(window, alpha=_AZIMUTHS // _PER_COLUMN)
-    column, level = _neighbours(column, level, batch.num_windows * _AZIMUTHS // _PER_COLUMN, _LEVELS)
 
-    in_quadrant = (azimuth_of_row[:-1] % (_AZIMUTHS // 4) + 0.5).double() / (_AZIMUTHS // 4)
-    width = 4 / (in_quadrant.square() + (1 - in_quadrant).square())  # of the bin of azimuth, in bins of gaps
-    gap = torch.cat(((azimuth_of_row.diff() * width).long(), level.diff())).clamp_(0, _GAPS - 1)
-    window = torch.cat(
-        (
-            floor_divide(row[:-1], _LEVELS // _PER_DEGREE),
-            floor_divide(column[:-1], _AZIMUTHS // _PER_COLUMN) + batch.num_windows,
-        )
-    )
-    is_gap = torch.cat((row.diff() == 0, column.diff() == 0)).long()
-    below = scatter_count(window * _GAPS + gap, 2 * batch.num_windows * _GAPS, is_gap).view(-1, _GAPS).cumsum(1)
+def _median_gap(direction: Tensor, lines: Lattice, num_windows: int, width: Callable[[Tensor], Tensor]) -> Tensor:
+    """Return the median of the gaps between neighbouring directions of a line, (B,) float64, bins of gaps; 0 = few.
+
+    Args:
+        direction: (K,) int64, cells of the lattice, which has an image for each window, and a row for each line.
+        width: tells how wide the cells of a line are, in bins of gaps.
+    """
+    occupied = flat_nonzero(draw(direction, num_windows * lines.area))
+    line, cell = split_index(occupied, lines.width)
+    gap = (cell.diff() * width(cell[:-1])).long().clamp_(0, _GAPS - 1)
+    window = floor_divide(line[:-1], lines.height)
+    counts = Groups(window * _GAPS + gap, num_windows * _GAPS).sum((line.diff() == 0).long())
+    below = counts.view(-1, _GAPS).cumsum(1)
     median = (2 * below < below[:, -1:]).sum(1)  # the first bin that reaches half
-    across, up = (median.double() * (below[:, -1] >= _FEWEST)).view(2, -1)
-    return across / _AZIMUTHS, up / (57.3 * _PER_DEGREE)
+    return median.double() * (below[:, -1] >= _FEWEST)
 
 
-def _neighbours(line: Tensor, cell: Tensor, num_lines: int, num_cells: int) -> tuple[Tensor, Tensor]:
-    """Sort directions by their line and cell, and drop equal ones: (K,) int64 each to (L,) each."""
-    occupied = draw(line * num_cells + cell, num_lines * num_cells)
-    return split_index(flat_nonzero(occupied), num_cells)
+def _width_of_azimuth(azimuth: Tensor) -> Tensor:
+    """Return the widths of bins of azimuth, (K,) float64, in bins of gaps."""
+    in_quadrant = (azimuth % (_AZIMUTHS // 4) + 0.5).double() / (_AZIMUTHS // 4)
+    return 4 / (in_quadrant.square() + (1 - in_quadrant).square())

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.groups import FAR, Groups
-from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_zeros, split_index, take_columns
+from cflow_torch.ops.indices import constant, divide, flat_nonzero, gather, lazy_zeros, split_index, take_columns
 from cflow_torch.ops.medians import masked_median
 from cflow_torch.verified.columns import Pixels
 from cflow_torch.verified.component_tree import Components, NodeKind, Tree
@@ -127,35 +127,31 @@ class _Map:
     """A map of each sweep with a part in each cell; of several parts, the last one."""
 
     def __init__(self, sweeps: HeightSlicedSweeps, parts: _Parts) -> None:
-        grid = sweeps.grid
-        self._cell = max(1, round(_CELL / grid.pixel_size))  # finest pixels
-        # An empty border as wide as the farthest neighbours, so that they need no tests.
-        self._height = (grid.height - 1) // self._cell + 1 + 2 * _REACH
-        self._width = (grid.width - 1) // self._cell + 1 + 2 * _REACH
+        self._side = max(1, round(_CELL / sweeps.grid.pixel_size))  # finest pixels
+        # A border as wide as the farthest neighbours, so that they need no tests.
+        self._lattice = sweeps.grid.lattice(self._side, border=_REACH)
         self._num_steps = sweeps.num_steps
-        num_cells = sweeps.batch.num_windows * sweeps.num_steps * self._height * self._width
+        num_cells = sweeps.batch.num_windows * sweeps.num_steps * self._lattice.area
         number = torch.arange(1, len(parts) + 1, dtype=torch.int32, device=parts.step.device)
-        place = self._place(parts.window, parts.step, parts.centre)
+        cell = self._cell_of(parts.window, parts.step, parts.centre)
         self._part = lazy_zeros(num_cells, torch.int32, number.device)  # 0 = none
-        self._part.scatter_reduce_(0, place, number, "amax")
+        self._part.scatter_reduce_(0, cell, number, "amax")
 
     def around(self, window: Tensor, step: Tensor, centre: Tensor, reach: int) -> tuple[Tensor, Tensor]:
         """Return the parts in the cells around places, (..., (2 reach + 1)^2), and whether there is one.
 
         `centre` is (2, ...), finest pixels, `window` and `step` are (...).
         """
-        line = torch.arange(-reach, reach + 1, device=centre.device)
-        offset = (line[:, None] * self._width + line).view(-1)
-        place = self._place(window, step, centre)[..., None] + offset
-        part = self._part.index_select(0, place.view(-1)).view_as(place)
+        cell = self._cell_of(window, step, centre)[..., None] + self._lattice.square(reach, centre.device)[:, 0]
+        part = self._part.index_select(0, cell.view(-1)).view_as(cell)
         return (part - 1).clamp_(min=0).long(), part > 0
 
-    def _place(self, window: Tensor, step: Tensor, centre: Tensor) -> Tensor:
+    def _cell_of(self, window: Tensor, step: Tensor, centre: Tensor) -> Tensor:
         """Return the cells of places; the nearest cells for places outside of the region."""
-        row, col = (centre / self._cell).floor_().long() + _REACH
-        row = row.clamp_(_REACH, self._height - 1 - _REACH)
-        col = col.clamp_(_REACH, self._width - 1 - _REACH)
-        return ((window * self._num_steps + step) * self._height + row) * self._width + col
+        row, col = divide(centre, self._side).floor_().long()
+        row = row.clamp_(0, self._lattice.height - 1)
+        col = col.clamp_(0, self._lattice.width - 1)
+        return self._lattice.cell(window * self._num_steps + step, row, col)
 
 
 @dataclass(frozen=True)
@@ -176,8 +172,8 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     interval = before_t.gather(1, parts.step.index_select(0, other)[:, None])[:, 0]
     centre = take_columns(parts.centre, of_t)
     velocity = (centre - take_columns(parts.centre, other)) / interval  # [2, H]
-    place = centre[..., None] - velocity[..., None] * before_t  # [2, H, S]
-    part, error = _follow(parts, cells, of_t, place)  # [H, S] each
+    expected = centre[..., None] - velocity[..., None] * before_t  # [2, H, S]
+    part, error = _follow(parts, cells, of_t, expected)  # [H, S] each
     moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()  # [H, S]
     is_found, cost = _judge(sweeps, window, error, moved)
     kept = flat_nonzero(_are_best(cost, part, len(parts)))
@@ -211,16 +207,16 @@ def _judge(sweeps: HeightSlicedSweeps, window: Tensor, error: Tensor, moved: Ten
     return is_found, cost.masked_fill(~is_confirmed, math.inf)
 
 
-def _follow(parts: _Parts, cells: _Map, of_t: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+def _follow(parts: _Parts, cells: _Map, of_t: Tensor, expected: Tensor) -> tuple[Tensor, Tensor]:
     """Find the nearest part of each sweep to where a velocity puts a part of t, and its distance, (H, S) each.
 
-    `of_t` is (H,), and `place` is (2, H, S), finest pixels. In t, the nearest part is the part itself, and the distance
-    is 0. Without a part near, the distance is infinite.
+    `of_t` is (H,), and `expected`, (2, H, S), finest pixels, is where the velocity puts the part. In t, the nearest
+    part is the part itself, and the distance is 0. Without a part near, the distance is infinite.
     """
-    step = torch.arange(place.shape[2], device=of_t.device).expand(place.shape[1:])
+    step = torch.arange(expected.shape[2], device=of_t.device).expand(expected.shape[1:])
     window = parts.window.index_select(0, of_t)[:, None].expand_as(step)
-    part, is_part = cells.around(window, step, place, _NEAR)  # [H, S, 25]
-    square = (_centres(parts, part) - place[..., None]).square_().sum(0).masked_fill_(~is_part, math.inf)
+    part, is_part = cells.around(window, step, expected, _NEAR)  # [H, S, 25]
+    square = (_centres(parts, part) - expected[..., None]).square_().sum(0).masked_fill_(~is_part, math.inf)
     nearest, index = square.min(2)  # [H, S]
     part = part.gather(2, index[..., None])[..., 0]
     part[:, 1] = of_t
@@ -251,7 +247,7 @@ def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: fl
     other, is_part = cells.around(window, step, centre[:, None].expand(2, *step.shape), _REACH)  # [steps, of t, 289]
     distance = (_centres(parts, other) - centre[:, None, :, None]).square_().sum(0).sqrt_()
     seconds = (sweeps.batch.seconds - sweeps.batch.seconds[:, 1:2]).abs()[window, step]
-    farthest = max_speed * seconds / sweeps.grid.pixel_size + 1
+    farthest = divide(max_speed * seconds, sweeps.grid.pixel_size) + 1
     nearest = _LEAST_MOVE * parts.length.index_select(0, of_t)
     is_pair = is_part & (distance <= farthest[..., None]) & (distance >= nearest[:, None])
     if sweeps.batch.has_pairs:
@@ -264,9 +260,9 @@ def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: fl
 def _are_alike(sweeps: HeightSlicedSweeps, parts: _Parts, of_t: Tensor, other: Tensor) -> Tensor:
     """Tell which other parts, (..., N, M), are of like size as N parts of t, if the window is a pair. Else all are."""
     size = parts.by_part.size()
-    own = size.index_select(0, of_t)[:, None]
+    size_at_t = size.index_select(0, of_t)[:, None]
     size = size.index_select(0, other.view(-1)).view_as(other)
-    is_like = (size <= _LIKE * own) & (own <= _LIKE * size)
+    is_like = (size <= _LIKE * size_at_t) & (size_at_t <= _LIKE * size)
     return is_like | sweeps.has_history.index_select(0, parts.window.index_select(0, of_t))[:, None]
 
 

@@ -97,8 +97,8 @@ def make_batch(
     """Check windows, bring every sweep into the frame of its t+1, and keep the active points.
 
     Args:
-        windows: N windows, at least one.
-        config: settings of a method. If a window has more history than `num_history`, we use the newest sweeps.
+        windows: N windows, at least one, without older sweeps that the method ignores (`keep_nearest`).
+        config: settings of a method.
         grid: grid of the images, of any scale; it contains the region.
         device: device of the batch.
         num_axes: coordinates to keep, 2 or 3.

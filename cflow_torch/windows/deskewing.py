@@ -8,10 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cflow_torch.ops.indices import divide
 from cflow_torch.tensors import read_positions
 from cflow_torch.transforms import relative_transform, rigid_transform
 from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy, check_array, point_rows
 from cflow_torch.windows.ego_motion import compensate
+from cflow_torch.windows.timeline import SourceSweep, elapsed_times
 
 DIRECTIONS = {"clockwise": -1.0, "counterclockwise": 1.0}  # seen from above -> sign of the growing azimuth
 STARTS = {"": 0.5, "_left": 0.25, "_ahead": 0.0, "_right": -0.25}  # ending of the name -> azimuth of the start, turns
@@ -124,35 +126,32 @@ def deskew_objects(window: Window, result: FlowResult, sweep_interval: float = 0
     Args:
         window: the sweeps of the flow; `pc0.point_times` and the poses and time stamps of pc0 and pc1 are used.
         result: flow of the points of pc0, by a preset that uses point times (`default`, `offline`, `live`).
-        sweep_interval: seconds from t to t+1 where the two have no time stamps.
+        sweep_interval: seconds from t to t+1 if a sweep of the window has no time stamp, as in the settings.
 
     Returns:
         (N, 3) float64, metres, ego frame of sweep t, on the device of the result. Points that are static or have no
         flow keep their positions.
 
     Raises:
-        CFlowError: the sweep has no point times, t+1 is not after t, or the result has another number of points or
-            lacks the residual flow.
+        CFlowError: the sweep has no point times, t+1 is not after t, `sweep_interval` is not positive, or the result
+            has another number of points or lacks the residual flow.
 
     Examples:
         >>> result = VerifiedFlow.from_preset("default")([window])[0]
         >>> points = deskew_objects(window, result)
     """
     before = window.pc0
-    after = window.pc1
     if before.point_times is None:
         raise CFlowError("the sweep has no times of points: give Sweep(points, point_times=...)")
     if result.residual_flow is None or len(result.residual_flow) != len(before.points):
         raise CFlowError(f"give the residual flow of each of the {len(before.points)} points of pc0")
-    interval = sweep_interval
-    if before.timestamp_ns is not None and after.timestamp_ns is not None:
-        interval = (after.timestamp_ns - before.timestamp_ns) / 1e9
+    ((_, interval),) = elapsed_times(window, [SourceSweep("pc0", before, 1)], sweep_interval)
     if not interval > 0:
-        raise CFlowError(f"t+1 is {interval} s after t: give time stamps in order, or a positive sweep_interval")
+        raise CFlowError(f"sweep_interval={sweep_interval} is not a positive number of seconds")
     flow = result.residual_flow.double().t()
     if before.pose is not None:  # from the axes of t+1 to the axes of t
-        rotation = relative_transform(before.pose, after.pose)
+        rotation = relative_transform(before.pose, window.pc1.pose)
         rotation[:3, 3] = 0
         flow = compensate(flow, rotation)
     times = torch.as_tensor(before.point_times).to(flow.device, torch.float64)
-    return (read_positions([before], flow.device) - flow * (times / interval)).t()
+    return (read_positions([before], flow.device) - flow * divide(times, interval)).t()

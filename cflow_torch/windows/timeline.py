@@ -12,7 +12,7 @@ from cflow_torch.config import Config
 from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import CFlowError, Sweep, Window, as_numpy, named_sweeps
 from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.validation import have_same_points, keep_nearest
+from cflow_torch.windows.validation import have_same_points
 
 # Largest plausible distance of an ego position from the one at t+1, metres: 2 s at 50 m/s.
 _FARTHEST_POSE = 100.0
@@ -49,7 +49,6 @@ class Timeline:
     @staticmethod
     def of(windows: Sequence[Window], config: Config, grid: Grid, needs_times: bool) -> Timeline:
         """Check everything but the points, and list the sweeps. Arguments and errors as in `make_batch`."""
-        windows = [keep_nearest(window, config.num_history) for window in windows]
         sources = [source_sweeps(window, config) for window in windows]
         sides = [_side(of_window, is_past=True) for of_window in sources]
         if config.num_future > 0:
@@ -60,7 +59,7 @@ class Timeline:
         entries: list[Entry] = []
         for index, side in enumerate(sides):
             number = index % len(windows)
-            times = elapsed_times(windows[number], side, config)
+            times = elapsed_times(windows[number], side, config.sweep_interval)
             table[:2, index, 1 : 1 + len(side)] = np.transpose(times)
             # If one sweep lacks times of points, de-skewing the others would shift them against it.
             sweeps = [windows[number].pc1, *(source.sweep for source in sources[number])]
@@ -141,13 +140,14 @@ def _is_same(a: Sweep, b: Sweep) -> bool:
     return have_same_points(a, b)
 
 
-def elapsed_times(window: Window, sources: Sequence[SourceSweep], config: Config) -> list[tuple[float, float]]:
+def elapsed_times(window: Window, sources: Sequence[SourceSweep], sweep_interval: float) -> list[tuple[float, float]]:
     """Return the time from each source to t+1 in sweep intervals and in seconds, negative for sources after t+1.
 
-    We take the time from the time stamps if all sweeps have one, otherwise from `sweep_interval`.
+    The first source is t. We take the time from the time stamps if all sweeps of the window have one, otherwise from
+    `sweep_interval`, seconds.
     """
     if any(sweep.timestamp_ns is None for sweep in window.sweeps):
-        return [(float(source.intervals), source.intervals * config.sweep_interval) for source in sources]
+        return [(float(source.intervals), source.intervals * sweep_interval) for source in sources]
     newest = _nanoseconds(window.pc1, "pc1")
     gaps = [newest - _nanoseconds(source.sweep, source.name) for source in sources]
     past, future = ([sign * gap for gap, s in zip(gaps, sources) if sign * s.intervals > 0] for sign in (1, -1))

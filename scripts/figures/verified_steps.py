@@ -62,7 +62,7 @@ def take_steps(drive: Any) -> tuple[Any, ...]:
     blocks = [round(size / config.pixel_sizes[-1]) for size in config.pixel_sizes]
     components = find_components(sweeps, change, blocks)
     sweeps, tree = add_overhung(sweeps, components, movable_nodes(sweeps, components, config.max_object_length))
-    candidates = propose(tree, blocks, sweeps, config)
+    candidates = propose(sweeps, tree, blocks, config)
     verdict = verify(sweeps, tree, candidates.motion, config.significance)
     tree = add_unchanged(sweeps, tree, verdict.motion)
     objects = select_objects(sweeps, components, tree, verdict, config.significance)

@@ -10,7 +10,8 @@ from scipy import ndimage
 
 from cflow_torch.ops import morphology
 from cflow_torch.ops.cross_correlation import cross_correlate
-from cflow_torch.ops.indices import floor_divide, scatter_count, split_index, unique_pairs
+from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.indices import divide, floor_divide, split_index, unique_pairs
 from cflow_torch.ops.kornia_engine import close_3x3_kornia
 from cflow_torch.ops.labeling import pad
 from cflow_torch.ops.linear import adjugate, full, upper
@@ -119,17 +120,23 @@ def test_indices_are_divided_like_integers():
     assert floor_divide(torch.tensor(7), 2) == 3 and floor_divide(torch.tensor(7), 2).shape == ()
 
 
+def test_numbers_are_divided_and_not_multiplied_by_a_reciprocal():
+    values = np.random.default_rng(0).normal(size=(3, 100))
+    assert not np.array_equal(values / 0.1, values * (1 / 0.1))
+    assert np.array_equal(divide(torch.from_numpy(values), 0.1).numpy(), values / 0.1)
+
+
 def test_counts_are_those_of_bincount():
     rng = np.random.default_rng(0)
     for number, size in [(0, 0), (0, 4), (1, 1), (50, 7), (1000, 300)]:
         index = rng.integers(0, max(size, 1), number)
         weights = rng.integers(-(2**40), 2**40, (3, number))
-        given = torch.from_numpy(index)
-        assert scatter_count(given, size).tolist() == np.bincount(index, minlength=size).tolist()
+        groups = Groups(torch.from_numpy(index), size)
+        assert groups.size().tolist() == np.bincount(index, minlength=size).tolist()
         expected = [[int(row[index == i].sum()) for i in range(size)] for row in weights]
-        assert scatter_count(given, size, torch.from_numpy(weights)).tolist() == expected
-        assert scatter_count(given, size, torch.from_numpy(weights[1])).tolist() == expected[1]
-        halves = scatter_count(given, size, torch.from_numpy(weights / 2))
+        assert groups.sum(torch.from_numpy(weights)).tolist() == expected
+        assert groups.sum(torch.from_numpy(weights[1])).tolist() == expected[1]
+        halves = groups.sum(torch.from_numpy(weights / 2))
         assert halves.shape == (3, size) and halves.dtype == torch.float64
         assert halves.tolist() == [[total / 2 for total in row] for row in expected]
 

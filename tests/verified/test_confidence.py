@@ -192,7 +192,7 @@ def test_a_remnant_has_the_margin_of_its_whole_node():
     bins = []
     for pixels in (every >= 0, is_remnant):
         by_object = Groups(torch.where(pixels, 0, 1), 1)
-        objects = Objects(by_object, Groups(zero, 1), by_object.first())
+        objects = Objects(by_object, Groups(zero, 1), window=zero)
         bins.append(int(motion_margin.motion_margin(sweeps, tree, objects, rigid).bin))
     assert int(is_remnant.sum()) == 2 and bins[0] == bins[1]
 

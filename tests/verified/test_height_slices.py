@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 from moving_scenes import from_images
-from oracle.height_slices import NUM_SLICES, ground_slope, is_residue
-from oracle.height_slices import slice_of as oracle_slice_of
+from oracle.height_slices import NUM_SLICES, ground_slope, is_residue, slice_of
 from oracle.pixels import in_range
 from oracle.sweeps import compensate, ground_points
 from preset_windows import changed
@@ -20,7 +19,7 @@ from turning_car import MODEL, REGION, turning_car
 from cflow_torch import Sweep, VerifiedFlow, Window
 from cflow_torch.ground.heights import GroundHeights
 from cflow_torch.verified.columns import BORDER, OWN, count_slices
-from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps, pack_bits, slice_of
+from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps, layer_of, pack_bits
 
 SIZE = 0.25
 PLAIN = config("verified", min_height=None, num_history=3)
@@ -31,7 +30,7 @@ LOW, HIGH = np.array(RANGE[:3]), np.array(RANGE[3:])
 def drawn(sweeps: HeightSlicedSweeps) -> np.ndarray:
     """Bytes of all positions of B windows, then of B windows of copies, and S sweeps, (2 B, S, H, W)."""
     columns = sweeps.columns
-    images = columns.image.view(-1, columns.grid.height + 2 * BORDER, columns.stride)
+    images = columns.image.view(-1, columns.grid.height + 2 * BORDER, columns.lattice.stride)
     column = images[:, BORDER:-BORDER, BORDER:-BORDER].long()
     return columns.slices[:, : sweeps.num_steps][column].permute(0, 3, 1, 2).numpy()
 
@@ -78,7 +77,7 @@ def test_copies_are_columns_of_their_own():
     assert all(torch.equal(getattr(of_copy, name), getattr(own, name)) for name in ("step", "row_col"))
     slices = copies.columns.look_up(of_copy, of_copy.step) & OWN
     assert torch.equal(slices, of_copy.slices) and bool((slices & ~own.slices == 0).all())
-    points = slice_of(sweeps.batch.positions[2, rows], SLICE_HEIGHT).long()
+    points = layer_of(sweeps.batch.positions[2, rows], SLICE_HEIGHT).long() & 3
     assert bool(((slices.long() >> points) & 1).all()) and (slices != own.slices).any()
     around = copies.around(torch.arange(copies.num_pixels), 0)
     assert torch.equal(around.of_item, torch.arange(copies.num_pixels))
@@ -86,10 +85,10 @@ def test_copies_are_columns_of_their_own():
 
 def test_slices_by_hand():
     z = torch.tensor([0.0, 0.49, 0.5, 1.0, 1.99, 2.0, -0.01, -0.5, -0.51, -2.0, 1e300, -1e300], dtype=torch.float64)
-    assert slice_of(z, 0.5).tolist() == [0, 0, 1, 2, 3, 0, 3, 3, 2, 0, 0, 0]
-    assert slice_of(z[:10], 0.1, 16).tolist() == oracle_slice_of(z[:10].numpy(), 0.1, 16).tolist()
+    assert (layer_of(z, 0.5) & 3).tolist() == [0, 0, 1, 2, 3, 0, 3, 3, 2, 0, 0, 0]
+    assert (layer_of(z[:10], 0.1) & 15).tolist() == slice_of(z[:10].numpy(), 0.1, 16).tolist()
     infinite = torch.tensor([math.inf, -math.inf, math.nan], dtype=torch.float64)
-    assert slice_of(infinite, 0.5).tolist() == [0, 0, 0]
+    assert (layer_of(infinite, 0.5) & 3).tolist() == [0, 0, 0]
     every = torch.arange(16, dtype=torch.uint8)
     assert count_slices(every).tolist() == [bin(value).count("1") for value in range(16)]
     flags = (every[:, None] >> torch.arange(4)) & 1

@@ -76,7 +76,7 @@ def corrected(places: Sequence[Sequence[int]], given: Sequence[float], z: float 
     for row, col in places:
         images[:, 0, row, col] = 1
     sweeps = from_images(images, 0.25, np.array([[0.0, 1, -1], [0, 1, 2]]))
-    objects = number_objects(Groups(sweeps.pixels.window, 2))
+    objects = number_objects(sweeps, Groups(sweeps.pixels.window, 2))
     motion = torch.tensor([given] * 2, dtype=torch.float64)
     return best_nearby(sweeps, objects, motion, z).tolist()
 

@@ -15,7 +15,10 @@ from cflow_torch import Sweep, VerifiedFlow, Window
 from cflow_torch.config import VerifiedConfig
 from cflow_torch.verified.changed_pixels import ChangedPixels
 from cflow_torch.verified.component_tree import NodeKind, find_components, movable_nodes
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.overhangs import add_overhung
+from cflow_torch.verified.spacing import Spacing
+from cflow_torch.windows.collation import make_batch
 
 REGION = (-9.0, -7.0, -2.0, 9.0, 7.0, 40.0)
 SETTINGS = VerifiedConfig(pixel_sizes=(0.25,), point_cloud_range=REGION, min_height=None)
@@ -120,6 +123,18 @@ def error_under_crown(window: Window, result) -> float:
 def test_a_car_under_a_crown_has_its_motion(num_history, start):
     window = avenue(num_history, num_history, start)
     assert error_under_crown(window, VerifiedFlow(AVENUE)([window])[0]) < 0.1
+
+
+@pytest.mark.parametrize("angles", [[0.0], [0.0, 0.1]])
+def test_the_columns_of_copies_do_not_depend_on_other_windows(angles):
+    """In the second batch, the points of the other window are far apart."""
+    grid, angle = VerifiedFlow(AVENUE).grid(AVENUE.pixel_sizes[-1]), torch.tensor(angles).double()
+    spacing = Spacing(angle, angle, 2 * len(angles) - 1, False)
+    batch = make_batch([avenue(0), avenue(0, 1)][: len(angles)], AVENUE, grid, torch.device("cpu"), 3)
+    sweeps = HeightSlicedSweeps.of(batch, grid, None, lambda *_: spacing)
+    pixels = sweeps.pixels[sweeps.points[(batch.image == 0).nonzero()[:, 0]].of_item]
+    copies, _ = sweeps.columns.for_copies(sweeps.columns.column_of(pixels))
+    assert len(copies.cell) == 3528
 
 
 def test_without_overhangs_a_car_under_a_crown_has_a_wrong_motion(monkeypatch):

@@ -137,7 +137,7 @@ def test_long_static_objects_stay_static(longest, moves):
     scene = one_object([person((0.1, 0.0), rng), person((0.0, 0.0), rng)], (0.0, 0.0))
     nothing = torch.zeros(scene.sweeps.num_pixels, dtype=torch.bool)
     components = find_components(scene.sweeps, ChangedPixels(nothing, nothing, nothing), (1,))
-    objects = number_objects(components.of_level(0))
+    objects = number_objects(scene.sweeps, components.of_level(0))
     rigid, _ = refine(scene.sweeps, objects, torch.zeros_like(scene.flow), longest)
     assert bool(rigid.flow.any()) == moves
 
@@ -168,7 +168,8 @@ def slow_start(
             if wanted:
                 images[0, 0, row + sign * side[0], col + sign * side[1]] = slices
     sweeps = from_images(images)
-    (start,) = find_slow(sweeps, number_objects(Groups(sweeps.pixels.window, 1)), torch.zeros((1, 2)).double(), None)
+    objects = number_objects(sweeps, Groups(sweeps.pixels.window, 1))
+    (start,) = find_slow(sweeps, objects, torch.zeros((1, 2)).double(), None)
     return (start.flip(0) / sweeps.grid.pixel_size).tolist()
 
 

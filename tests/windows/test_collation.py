@@ -130,6 +130,17 @@ def test_windows_are_grouped_by_memory(monkeypatch):
     assert sizes() == [1] * 5 and split_windows([], grid, CPU, 160, None) == []
 
 
+def test_sweeps_that_are_ignored_need_no_memory(monkeypatch):
+    sizes: list[int] = []
+    model = make_model(config(num_history=1, max_memory=1.5e6), "cpu")
+    motion = model.motion
+    monkeypatch.setattr(model, "motion", lambda batch: sizes.append(batch.num_windows) or motion(batch))
+    windows = [scene(seed, num_history=4) for seed in range(4)]
+    model(windows)
+    model([replace(window, pch=window.pch[:1]) for window in windows])
+    assert sizes == [2, 2, 2, 2]
+
+
 FORMS: dict[str, Callable[[np.ndarray], Any]] = {
     "float16": lambda p: p.astype(np.float16),
     "float64": lambda p: p.astype(np.float64),

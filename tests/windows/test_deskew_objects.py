@@ -53,6 +53,12 @@ def test_each_point_moves_back_by_its_share_of_the_flow() -> None:
     moved = deskew_objects(window, FlowResult.of({"residual_flow": flow})).numpy() - window.pc0.points
     rotation = window.pc0.pose[:3, :3].T @ window.pc1.pose[:3, :3]
     assert np.allclose(moved, -(flow.numpy() @ rotation.T) * (window.pc0.point_times / 0.1)[:, None], atol=1e-12)
+    # The method takes the interval from time stamps if all sweeps have one, and so do we.
+    unstamped = replace(window, pch=tuple(replace(sweep, timestamp_ns=None) for sweep in window.pch))
+    slower = deskew_objects(unstamped, FlowResult.of({"residual_flow": flow}), 0.2).numpy() - window.pc0.points
+    with pytest.raises(CFlowError, match="is not a positive"):
+        deskew_objects(unstamped, FlowResult.of({"residual_flow": flow}), 0.0)
+    assert len(window.pch) > 0 and np.allclose(2 * slower, moved, atol=1e-12)
     still = replace(window, pc0=replace(window.pc0, point_times=np.zeros(1600)))
     assert np.array_equal(deskew_objects(still, FlowResult.of({"residual_flow": flow})), window.pc0.points)
 
@@ -62,7 +68,7 @@ def test_each_point_moves_back_by_its_share_of_the_flow() -> None:
     [
         ({"point_times": None}, 1600, "no times of points"),
         ({}, 3, "of each of the 1600 points"),
-        ({"timestamp_ns": 2 * 10**9}, 1600, "in order"),
+        ({"timestamp_ns": 2 * 10**9}, 1600, "out of order"),
     ],
 )
 def test_unusable_inputs_are_refused(change: dict, rows: int, message: str) -> None:

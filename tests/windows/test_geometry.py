@@ -12,7 +12,7 @@ from scenes import config, pose
 
 from cflow_torch import CFlowError
 from cflow_torch.transforms import relative_transform, rigid_transform
-from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.bev_grid import Grid, Lattice
 from cflow_torch.windows.ego_motion import compensate
 
 INF = math.inf
@@ -31,6 +31,22 @@ def test_pixels_equal_the_oracle(size):
     row, col = project_bev(points, settings, size).T
     assert (grid.pixel(torch.from_numpy(points.T.copy())).numpy() == row * grid.width + col).all()
     assert col.max() == grid.width - 1  # the upper end belongs to the last pixel
+
+
+def test_cells_are_numbered_image_after_image_in_raster_order():
+    lattice = Lattice(2, 3, border=1)
+    numbers = torch.tensor([[6, 7, 8, 11, 12, 13], [26, 27, 28, 31, 32, 33]])  # the picture in its docstring
+    image = torch.arange(2)[:, None].expand(2, 6)
+    row, col = torch.arange(6).expand(2, 6) // 3, torch.arange(6).expand(2, 6) % 3
+    assert torch.equal(lattice.cell(image, row, col), numbers)
+    assert torch.equal(lattice.cell(1, row.int(), col.int()), numbers[1].expand(2, 6).int())
+    split = lattice.split(numbers)
+    assert torch.equal(split[0], image) and torch.equal(split[1], torch.stack((row, col)))
+    assert lattice.split(torch.tensor([0]))[1].tolist() == [[-1], [-1]]  # in the border
+    assert (lattice.first, lattice.area) == (6, 20)
+    assert (12 + lattice.square(1, torch.device("cpu"))[:, 0]).tolist() == [6, 7, 8, 11, 12, 13, 16, 17, 18]
+    grid = Grid(0.5, (0.0, 0.0, -1.0), (4.0, 2.0, 1.0))  # 5 rows and 9 columns
+    assert grid.lattice() == Lattice(5, 9) and grid.lattice(2, border=1) == Lattice(3, 5, 1)
 
 
 def test_the_region_includes_both_ends_and_no_nan():
