@@ -54,7 +54,6 @@ DATA_SETS: dict[str, DataSet] = {
     "waymo": DataSet("WaymoLog", "Waymo segment", ("lidar/*.parquet",), "find_waymo_segments"),
     "pandaset": DataSet("PandaSetLog", "PandaSet sequence", ("lidar/poses.json",), depth=2),
     "aevascenes": DataSet("AevaScenesLog", "AevaScenes sequence", ("sequence.json",), depth=3),
-    # Folders velodyne with other files than KITTI's are folders of point clouds, see `recognise`.
     "kitti": DataSet(
         "KITTILog", "drive of KITTI", ("velodyne_points", "velodyne", "velodyne_points/data"), "find_kitti_drives"
     ),
@@ -88,7 +87,8 @@ def recognise(root: Any) -> str:
     """Return the name of the data set whose logs lie at a path. We open files only if their names do not decide.
 
     Args:
-        root: file or folder. If formats fit at several levels of folders, the level closest to the root decides.
+        root: file or folder. If formats fit at several levels of folders, the level closest to the root decides. If
+            there is a folder of point clouds, too, the first log of a format must be readable.
 
     Raises:
         CFlowError: the path does not exist, or no format fits, or several do.
@@ -97,22 +97,34 @@ def recognise(root: Any) -> str:
     with remote_errors(top):
         if not top.exists():
             raise CFlowError(f"{root}: there is no such file or folder")
-        level, fitting = [top], set()
+        level, found, marked = [top], [], [top]
         for _ in range(_DEEPEST):
-            fitting = {name for name, one in DATA_SETS.items() for path in level if any(map(path.match, one.marks))}
-            if fitting:
+            marks = [
+                (name, path) for name, one in DATA_SETS.items() for path in level if any(map(path.match, one.marks))
+            ]
+            found, marked = list(dict.fromkeys(name for name, _ in marks)), [path for _, path in marks]
+            if found:
                 break
             level = [path for folder in level for path in visible(folder)]
-    if fitting == {"kitti"} and not _has_logs("kitti", root):
-        fitting = set()
-    found = [name for name in DATA_SETS if name in fitting] or ["arrays"]
-    if len(found) > 1 or not fitting:  # nuScenes and TruckScenes have the same file names
-        found = [name for name in found if _has_logs(name, root)]
+    found = [name for name in found if _has_logs(name, root)]  # nuScenes and TruckScenes have the same file names
+    if found and _has_clouds(marked[0], top):  # folders of other data sets may be called so
+        opened = [name for name in found if _opens(name, root)]
+        found = ["arrays"] if not opened and _opens("arrays", root) else opened or found
+    if not found and _has_logs("arrays", root):
+        found = ["arrays"]
     if len(found) != 1:
         choose = f"choose one with data={'|'.join(DATA_SETS)}"
         fits = f"several formats fit, {' and '.join(found)}; {choose}"
         raise CFlowError(f"{root}: {fits if found else _why_nothing_fits(top) or f'no format fits; {choose}'}")
     return found[0]
+
+
+def _has_clouds(marked: Path, top: Path) -> bool:
+    """Test whether a marked path, or a folder between it and the top, is a folder of point clouds."""
+    from cflow_torch.data.arrays.folder import is_array_log
+
+    folders = [folder for folder in (marked, *marked.parents) if folder == top or top in folder.parents]
+    return any(map(is_array_log, folders))
 
 
 def matching_paths(path: Any) -> list[Any]:
@@ -195,6 +207,15 @@ def _why_nothing_fits(top: Path) -> str:
 def _has_logs(name: str, root: Any) -> bool:
     try:
         return len(find_sources(name, root)) > 0
+    except CFlowError:
+        return False
+
+
+def _opens(name: str, root: Any) -> bool:
+    """Test whether the first log under a path can be opened in a format."""
+    try:
+        _open(name, find_sources(name, root)[0], {}).close()
+        return True
     except CFlowError:
         return False
 

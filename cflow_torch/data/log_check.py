@@ -229,6 +229,7 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
         why, fix = "", "check that the points are x, y, z in metres, and "
         of_poses = "that the poses belong to this log and are of the points' frame (else give data.ego_T_lidar), "
         fix += f"{of_poses}their times, units and quaternions" if has_poses else "pass poses"
+        fix += "" if has_poses else ", unless the files are no successive sweeps of one drive, which have no flow"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
         fix = " or ".join(judgement.reading(each).fix or _setting(log, each) for each in judgement.best)
@@ -472,12 +473,12 @@ def _times(log: Log) -> list[Finding]:
     if usual <= 0 or (interval <= 0).any():
         return [Finding("times", WRONG, "times of sweeps do not ascend: give the time of each sweep")]
     gaps = gaps_in(interval)
-    text = f"{1 / usual:.1f} Hz"
+    text = f"{1 / (usual if gaps else interval.mean()):.1f} Hz"  # two sensors in turns: a short, then a long interval
     if gaps:
         longest = max(gaps, key=interval.__getitem__)
         text += f"; {len(gaps)} gaps, the longest of {interval[longest]:.1f} s after sweep {longest}"
         return [Finding("times", FOUND, f"{text}. No history or future of a window reaches over them")]
-    if not 0.01 <= usual <= 1:
+    if not 0.01 <= interval.mean() <= 1:
         return [Finding("times", WRONG, f"{text}: are the times in the unit that the reader expects?")]
     if _change(interval) > _UNEVEN:
         text += f", and intervals change by {100 * _change(interval):.0f} % from one to the next"

@@ -40,7 +40,12 @@ AXES = {  # ego_T_stored of frames with other axes: x, y and z of the stored fra
     "swapped_back": np.array([[0, -1, 0], [-1, 0, 0], [0, 0, 1]], float),
     "z_first": np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], float),  # z, x, y
 }
-MIRRORED = ("mirrored", "mirrored_back", "swapped", "swapped_back")  # left-handed
+MIRRORED = {  # left-handed
+    "mirrored": "the y axis of the points or that of the poses is mirrored",
+    "mirrored_back": "the x axis of the points or that of the poses is mirrored",
+    "swapped": "x and y of the points or of the poses are interchanged",
+    "swapped_back": "x and y of the points or of the poses are interchanged and reversed",
+}
 _DECIMAL = {"millimetres": 1e-3, "centimetres": 1e-2, "decimetres": 0.1, "kilometres": 1e3}
 UNITS = {**_DECIMAL, "inches": 0.0254, "feet": 0.3048}
 
@@ -199,26 +204,10 @@ READINGS: dict[str, Reading] = {
         "the poses are steps (each maps the sweep before to the frame of the sweep)",
         lambda poses: _joined(np.linalg.inv(poses)),
     ),
-    "mirrored": Reading(
-        "the y axis of the points or that of the poses is mirrored (left-handed)",
-        _mirrored(AXES["mirrored"]),
-        margin=_OF_MIRRORED,
-    ),
-    "mirrored_back": Reading(
-        "the x axis of the points or that of the poses is mirrored (left-handed)",
-        _mirrored(AXES["mirrored_back"]),
-        margin=_OF_MIRRORED,
-    ),
-    "swapped": Reading(
-        "x and y of the points or of the poses are interchanged (left-handed)",
-        _mirrored(AXES["swapped"]),
-        margin=_OF_MIRRORED,
-    ),
-    "swapped_back": Reading(
-        "x and y of the points or of the poses are interchanged and reversed (left-handed)",
-        _mirrored(AXES["swapped_back"]),
-        margin=_OF_MIRRORED,
-    ),
+    **{
+        name: Reading(f"{cause} (left-handed)", _mirrored(AXES[name]), margin=_OF_MIRRORED)
+        for name, cause in MIRRORED.items()
+    },
     "transposed": Reading("the rotations of the poses are transposed, but not their positions", _transposed(np.eye(3))),
     "compass": Reading(
         "the angles of the poses are compass headings (clockwise from north)", _transposed(AXES["left"])

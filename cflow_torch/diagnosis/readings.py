@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.diagnosis.conventions import (
+    AXES,
     MIRRORED,
     MOUNT,
     MOUNTS,
@@ -32,7 +33,7 @@ from cflow_torch.diagnosis.conventions import (
     scaled,
 )
 from cflow_torch.diagnosis.stillness import FEWEST_POINTS, LEAST_SHARE, Structure, cell_keys, structure_rows
-from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about, transform_points
+from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about, transform_points, turn_of
 from cflow_torch.types import Array, Sweep, as_numpy
 from cflow_torch.windows.deskewing import DIRECTIONS, INSTANTS, SCANS
 
@@ -63,6 +64,10 @@ _OF_ERRORS = 1.2  # least share with another motion in each pair over that as gi
 _EXCUSE = 1.1  # share with another motion in each pair over that of a reading with a name
 _SLIGHT, _OBLIQUE = np.radians((2, 10))  # least angles between axes that are turned and those as given, or with a name
 _RESCALED = 1.05  # least factor between motions of another scale
+_OF_UNIT = 1.5  # largest factor between a scale, which is not exact, and that of a unit, which the points then confirm
+_ITERATIONS = 3
+_WEAK, _UNSHOWN = 0.1, 0.15  # metres of no rotation, and of no place a metre away: what the motions do not show
+_DIRECTIONS = (("ahead", "back"), ("left", "right"), ("up", "down"))
 _UNCLEAR = 0.15  # share of a pair as given, below which its motion is compared with that under which the points fit
 # Metres of such a motion from that of the poses. Less in all pairs is within the cells of the search; more, or more
 # than half of the motion, is more than an error of measurement.
@@ -82,7 +87,8 @@ _BETWEEN = 0.2 * np.array([(x, y) for x in range(-1, 2) for y in range(-1, 2)])
 
 
 _COMPARED = {**READINGS, **MOUNTS, **SCAN_READINGS}
-_OF_POSES = {name: reading.of_poses for name, reading in _COMPARED.items() if reading.of_poses and name != REVERSED}
+_DERIVED = (REVERSED, *UNITS)  # these follow from all poses of a log, and from the lengths of motions
+_OF_POSES = {name: reading.of_poses for name, reading in _COMPARED.items() if reading.of_poses and name not in _DERIVED}
 
 
 class ScannedStructure:
@@ -149,6 +155,11 @@ class Judgement:
     def given(self) -> float:
         """Share of structure in place as given, NaN = nothing could be compared."""
         return self.shares.get(GIVEN, float("nan"))
+
+    @property
+    def fits(self) -> float:
+        """Share of structure in place under the best reading."""
+        return self.shares.get(self.best[0], self.given) if self.best else self.given
 
     def reading(self, name: str) -> Reading:
         """Return what a reading means."""
@@ -217,9 +228,6 @@ def _transforms(poses: np.ndarray, rows: tuple[int, int]) -> dict[str, np.ndarra
     """Return T_1_0 of two rows of poses, (L, 4, 4), under each reading that moves points otherwise than as given."""
     T = _between(poses, rows)
     read = {name: _between(convert(poses), rows) for name, convert in _OF_POSES.items()}
-    for name in UNITS:  # under them the vehicle still moves, else they say no more than `STILL`
-        if np.linalg.norm(read[name][:3, 3]) < _LEAST_DIFFERENCE:
-            del read[name]
     shown = {name: other for name, other in read.items() if name == STILL or difference(T, other) >= _LEAST_DIFFERENCE}
     return {GIVEN: T, **shown}
 
@@ -243,6 +251,16 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
         return replace(judgement, best=(NO_READING,)) if is_hopeless else judgement
     fast = [pair for pair in moving if len(pair.scans) > 1]
     scan, shares_of_scans = _best_scan(fast) if fast else (moving[0].scans[0], {})
+    judgement = _judge_poses(moving, scan)
+    if judgement.best in ((NO_READING,), (INACCURATE,)):  # the sweeps may be skewed and the poses be of another frame
+        scans = [each for each in DIRECTIONS if fast and each in fast[0].scans]
+        named = [each for each in (_judge_poses(moving, scan) for scan in scans) if each.fits > _TURN * judgement.fits]
+        judgement = max(named, key=lambda each: each.fits, default=judgement)
+    return replace(judgement, shares_of_scans=shares_of_scans if judgement.scan == scan else {})
+
+
+def _judge_poses(moving: Sequence[Pair], scan: str) -> Judgement:
+    """Compare the readings of the poses of pairs that move, under one scan."""
     of_pairs = [pair.shares_of_poses(scan) for pair in moving]
     found: dict[str, Reading] = {}
     if min(each[GIVEN] for each in of_pairs) < _UNCLEAR and not any(WORLD in each for each in of_pairs):
@@ -252,13 +270,13 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
             replace(pair, transforms={**pair.transforms, **other.transforms}) for pair, other in zip(moving, others)
         ]
     shares, clear = _compare(of_pairs)
-    judgement = Judgement(shares, found=found, scan=scan, shares_of_scans=shares_of_scans)
+    judgement = Judgement(shares, found=found, scan=scan)
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
         return replace(judgement, best=(WORLD,))
     clear = [name for name in clear if all(map(partial(_is_clear_in, name), moving, of_pairs))]
     if clear or shares[GIVEN] >= _HOPELESS:
         best = _equals(clear, shares)
-        elsewhere = {name: _mounting(0, *_place_of(moving, scan, 0)) for name in best if name in MOUNTS}
+        elsewhere = {name: _mounting(np.eye(3), _place_of(moving, scan, np.eye(3))) for name in best if name in MOUNTS}
         return replace(judgement, best=best, found={**found, **elsewhere})
     if any(pair.is_sparse for pair in moving):
         return Judgement({})
@@ -303,8 +321,8 @@ def _is_small(name: str) -> bool:
 def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Reading], list[Pair]]:
     """Compare the motions of the poses with those under which the points fit.
 
-    They may be turned by an angle, also if the LiDAR is elsewhere; turns by nearly a multiple of 90 degrees alone are
-    left out, because such readings have names. They may be longer or shorter. Or each pair has another small error.
+    They may be of a frame that is turned, and elsewhere, unless such a reading has a name. They may be longer or
+    shorter. Or each pair has another small error.
 
     Returns:
         These readings, and the pairs with those of them that each shows.
@@ -331,22 +349,29 @@ def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Readin
 
 
 def _readings_of_motions(pairs: Sequence[Pair], scan: str, motions: Sequence[np.ndarray]) -> dict[str, Reading]:
-    """Return how motions of the poses may differ from those of the points, (4, 4) each: turned, or scaled."""
+    """Return how motions of the poses may differ from those of the points, (4, 4) each: of another frame, or scaled."""
     steps = [pair.transforms[GIVEN] for pair in pairs]
-    given, fitted = (np.array([complex(*T[:2, 3]) for T in each]) for each in (steps, motions))
-    product = complex(given @ fitted.conj())
-    turn, scale = float(np.angle(product)), float(abs(product) / max(np.sum(np.abs(given) ** 2), 1e-9))
-    turns = np.angle(given * fitted.conj())
-    is_slight = abs(turn) > _SLIGHT and bool((turns * np.sign(turn) > abs(turn) / 2).all())  # not only in turns
-    quarter = round(turn / (np.pi / 2)) * np.pi / 2
-    is_oblique = abs(turn - quarter) > _OBLIQUE
-    turn = turn if is_oblique else quarter or turn
-    place = _place_of(pairs, scan, turn) if is_oblique or quarter else np.zeros(2)
+    given, fitted = (np.array(each)[:, :3, 3] for each in (steps, motions))
+    lengths = [np.linalg.norm(each, axis=1) for each in (given, fitted)]
+    scale = float(lengths[0] @ lengths[1] / max(lengths[0] @ lengths[0], 1e-9))
+    rotation = _rotation_between(np.array(steps), np.array(motions), scale)
+    axes = np.round(rotation)
+    is_turned = not np.array_equal(axes, np.eye(3))
     found = {}
-    if is_oblique or place.any() or (quarter == 0 and is_slight):  # else the turn has a name
-        found[MOUNTED] = _mounting(turn, *place)
-    if quarter == 0 and max(np.abs(fitted - given)) > _SMALLEST_ERROR:
-        found[MOUNT] = _mounting(0, *_place_of(pairs, scan, 0))
+    if turn_of(axes.T @ rotation) > _OBLIQUE or not np.array_equal(axes @ axes.T, np.eye(3)):
+        found[MOUNTED] = _mounting(rotation, _place_of(pairs, scan, rotation))
+    elif is_turned:
+        rotation = axes if axes[2, 2] == 1 else rotation
+        place = _place_of(pairs, scan, rotation)
+        names = [name for name, known in AXES.items() if name in READINGS and np.array_equal(axes.T, known)]
+        if place.any() or not names:
+            found[MOUNTED] = _mounting(rotation, place)
+    elif turn_of(rotation) > _SLIGHT:
+        is_better = np.linalg.norm(given - fitted @ rotation.T, axis=1) < np.linalg.norm(given - fitted, axis=1)
+        found.update({MOUNTED: _mounting(rotation, np.zeros(3))} if is_better.all() else {})  # not only in turns
+    if not is_turned and np.linalg.norm((fitted - given)[:, :2], axis=1).max() > _SMALLEST_ERROR:
+        found[MOUNT] = _mounting(axes, _place_of(pairs, scan, axes))
+    found.update({name: READINGS[name] for name, unit in UNITS.items() if 1 / _OF_UNIT < scale / unit < _OF_UNIT})
     if scale > _RESCALED or 1e-9 < scale < 1 / _RESCALED:
         found[SCALED] = Reading(
             f"the positions of the poses are {1 / scale:.3g} times as long as the motion of the points",
@@ -356,22 +381,50 @@ def _readings_of_motions(pairs: Sequence[Pair], scan: str, motions: Sequence[np.
     return found
 
 
-def _mounting(turn: float, x: float = 0.0, y: float = 0.0) -> Reading:
-    """Return the reading of points whose frame is turned about z, radians, and lies at (x, y) in that of the poses."""
+def _rotation_between(steps: np.ndarray, motions: np.ndarray, scale: float) -> np.ndarray:
+    """Return the rotation from the axes of the points to those of the poses, (3, 3) float64.
+
+    It maps directions and turns of the points' motions, (K, 4, 4) each, to those of the poses, whose steps are scaled.
+    In turns, a frame elsewhere has other steps: we estimate where it is, and correct them. What the motions do not
+    show, such as the roll on a straight road, stays as it is.
+    """
+    given, fitted = scale * steps[:, :3, 3], motions[:, :3, 3]
+    skew = [T[:, :3, :3] - T[:, :3, :3].transpose(0, 2, 1) for T in (steps, motions)]
+    turns = [_ARM / 2 * np.stack([each[:, 2, 1], each[:, 0, 2], each[:, 1, 0]], axis=1) for each in skew]
+    levers = np.eye(3) - steps[:, :3, :3]  # [K, 3, 3], times the place of the points is what they change of a step
+    place = np.zeros(3)
+    for _ in range(_ITERATIONS):
+        target = np.concatenate([given - levers @ place, turns[0], _WEAK * np.eye(3)])
+        source = np.concatenate([fitted, turns[1], _WEAK * np.eye(3)])
+        left, _, right = np.linalg.svd(target.T @ source)
+        rotation: np.ndarray = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+        rest = given - fitted @ rotation.T
+        shown = np.concatenate([levers.reshape(-1, 3), _UNSHOWN * np.eye(3)])
+        place = np.linalg.lstsq(shown, np.concatenate([rest.ravel(), np.zeros(3)]), rcond=None)[0]
+    return rotation
+
+
+def _mounting(rotation: np.ndarray, place: np.ndarray) -> Reading:
+    """Return the reading of points whose frame is turned, and lies at a place, (3,), in that of the poses."""
     causes = []
     fixes = []
-    if turn:
-        degrees = np.degrees(turn)
-        side = "left" if turn > 0 else "right"
+    where = "data.ego_T_lidar with"
+    if turn_of(rotation) > 0 and rotation[2, 2] > np.cos(_OBLIQUE):
+        degrees = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
+        side = "left" if degrees > 0 else "right"
         causes.append(f"the points' x axis points about {abs(degrees):.0f} degrees to the {side} of the poses'")
         fixes.append(f"a rotation of about {degrees:.0f} degrees about z")
-    if x or y:
-        place = f"x = {x:.1f} m and y = {y:.1f} m"
-        causes.append(f"the points' origin is at about {place} in the frame of the poses")
-        fixes.append(f"a position of about {place}")
-    ego_T_points = as_matrix(rotations_about(2, turn), (x, y, 0))
-    fix = f"data.ego_T_lidar with {' and '.join(fixes)} (data=arrays, hdf5 or bags)"
-    return Reading(", and ".join(causes), partial(_seen_from, ego_T_points), fix=fix)
+    elif turn_of(rotation) > 0:
+        names = [_DIRECTIONS[axis][int(row[axis] < 0)] for row in rotation for axis in [int(np.abs(row).argmax())]]
+        causes.append(f"the poses are of another sensor, whose x, y and z axes point {', '.join(names)}")
+        fixes.append(f"a rotation of about {(np.round(rotation, 3) + 0.0).tolist()}")
+        where = "data.ego_T_lidar, the transform from the LiDAR to it (in data=arrays with data.poses_of=sensor), with"
+    if place.any():
+        named = [f"{axis} = {value:.1f} m" for axis, value in zip("xyz", place) if axis != "z" or abs(value) > 0.05]
+        causes.append(f"the points' origin is at about {' and '.join(named)} in the frame of the poses")
+        fixes.append(f"a position of about {' and '.join(named)}")
+    fix = f"{where} {' and '.join(fixes)} (data=arrays, hdf5 or bags)"
+    return Reading(", and ".join(causes), partial(_seen_from, as_matrix(rotation, place)), fix=fix)
 
 
 def _seen_from(ego_T_points: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -379,35 +432,45 @@ def _seen_from(ego_T_points: np.ndarray, steps: np.ndarray) -> np.ndarray:
     return np.linalg.inv(ego_T_points) @ steps @ ego_T_points  # type: ignore[no-any-return]
 
 
-def _place_of(pairs: Sequence[Pair], scan: str, turn: float) -> np.ndarray:
-    """Return x and y in the frame of the poses at which the points' origin fits best, if their frame is turned.
+def _place_of(pairs: Sequence[Pair], scan: str, rotation: np.ndarray) -> np.ndarray:
+    """Return the place in the frame of the poses, (3,), at which the points' origin fits best, if they are turned.
 
-    0 and 0 if that fits as well, unless the frame is not turned.
+    It is at the height of the poses, as the points see it. 0 if that fits as well, unless the frame is not turned.
     """
     origin = np.zeros((1, 2))
     places = np.concatenate([origin, _PLACES])
     for count in (_FEW_POINTS, _MOST_POINTS, _MOST_POINTS):
-        ego_T_points = as_matrix(rotations_about(2, np.full(len(places), turn)))
-        ego_T_points[:, :2, 3] = places
+        ego_T_points = as_matrix(np.tile(rotation, (len(places), 1, 1)), places @ rotation[:, :2].T)
         shares = np.zeros(len(places))
         for pair in pairs:
             steps = _seen_from(ego_T_points, pair.transforms[GIVEN])
             shares += pair.target.structure(scan).shares(pair.source.points(scan)[:count], steps)
         best = places[1:][np.argsort(-shares[1:], kind="stable")]
         places = np.concatenate([origin, best[:_NUM_BEST] if len(best) > _NUM_BEST else best[0] + _BETWEEN])
-    return origin[0] if turn and shares[0] >= EQUAL * shares[1:].max() else best[0]  # type: ignore[no-any-return]
+    is_at_origin = turn_of(rotation) > 0 and shares[0] >= EQUAL * shares[1:].max()
+    return np.zeros(3) if is_at_origin else rotation[:, :2] @ best[0]
 
 
 def _motion_of(pair: Pair, scan: str) -> np.ndarray:
-    """Return the motion of a pair under which its points fit, with about the rotation of the poses, (4, 4) float64."""
-    rotation = pair.transforms[GIVEN].copy()
-    rotation[:2, 3] = 0
-    source = transform_points(pair.source.points(scan)[:_MOST_POINTS], rotation)
-    motion = find_motion(source, pair.target.points(scan), _SMALL_TURNS)
-    nearby = np.tile(motion, (len(_WITHIN_CELL), 1, 1))
-    nearby[:, :2, 3] += _WITHIN_CELL
-    shares = pair.target.structure(scan).shares(source, nearby)
-    return nearby[int(shares.argmax())] @ rotation
+    """Return the motion of a pair under which its points fit, (4, 4) float64.
+
+    It has about the rotation of the poses. If nothing fits then, it is one in the plane, by the angle of the poses.
+    """
+    step = pair.transforms[GIVEN].copy()
+    step[:2, 3] = 0
+    angle = float(turn_of(step))
+    most = -1.0
+    for rotation in (step, *(as_matrix(rotations_about(2, sign * angle)) for sign in (1, -1))):
+        source = transform_points(pair.source.points(scan)[:_MOST_POINTS], rotation)
+        motion = find_motion(source, pair.target.points(scan), _SMALL_TURNS)
+        nearby = np.tile(motion, (len(_WITHIN_CELL), 1, 1))
+        nearby[:, :2, 3] += _WITHIN_CELL
+        shares = pair.target.structure(scan).shares(source, nearby)
+        if shares.max() > most:
+            most, found = float(shares.max()), nearby[int(shares.argmax())] @ rotation
+        if most >= LEAST_SHARE:
+            break
+    return found
 
 
 def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:

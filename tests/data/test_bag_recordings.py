@@ -17,6 +17,7 @@ from cflow_torch import CFlowError
 from cflow_torch.data.bags import BagLog, find_bags
 from cflow_torch.data.bags.messages import cloud_columns, points_of
 from cflow_torch.data.catalog import open_log, recognise
+from cflow_torch.transforms import as_matrix
 from cflow_torch.types import CFlowWarning
 
 TF, CLOUD, ODOMETRY = "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry"
@@ -128,6 +129,20 @@ def test_an_odometry_of_a_frame_below_the_lidar_is_connected(tmp_path, recwarn) 
     log = BagLog(bag.close())
     assert log.frame == "velodyne" and world(log, bag.recording) < 5e-3
     assert not [each for each in recwarn if "no transform" in str(each.message)]
+
+
+def test_the_vehicle_is_the_level_frame_that_carries_the_lidar(tmp_path) -> None:
+    """Without base_link: a LiDAR that is tilted on a body, and clouds in the frame in which a body drives."""
+    bag = Recorder(tmp_path / "body")
+    bag.transform(bag.stamps[0], "body", "velodyne", MOUNT)
+    for stamp in range(bag.stamps[0] - 10**8, bag.stamps[-1] + 10**8, STEP):
+        bag.transform(stamp, "odom", "body", bag.recording.pose_at(stamp))
+        bag.transform(stamp, "map", "odom", as_matrix(np.eye(3), (stamp > bag.stamps[4], 0, 0)))
+    bag.clouds()
+    log = BagLog(bag.close())
+    assert log.frame == "body" and world(log, bag.recording) < 5e-3
+    given = BagLog(log.path, ego_T_lidar=MOUNT, frame="velodyne")
+    assert np.allclose(given.poses, log.poses), "the poses of the LiDAR tell those of the vehicle"
 
 
 def test_lost_poses_and_transforms_are_left_out_and_said(tmp_path) -> None:
@@ -274,6 +289,22 @@ def test_a_bad_transform_of_another_frame_stops_no_bag(tmp_path) -> None:
     assert world(BagLog(bag.close()), bag.recording) < 5e-3
 
 
+def test_a_clock_that_is_set_back_runs_on(tmp_path) -> None:
+    """The driver's clock, by NTP or PTP, in the middle of a recording, and one message that arrives late."""
+    bag = Recorder(tmp_path / "back")
+    bag.mount()
+    bag.drive()
+    bag.clouds(stamp=lambda stamp: stamp - 330_000_000 * (stamp >= bag.stamps[4]))
+    with pytest.warns(CFlowWarning, match=r"the clock of its clouds was set back by 0\.33 s"):
+        log = BagLog(bag.close())
+    assert list(log.timestamps) == list(bag.stamps) and world(log, bag.recording) < 5e-3
+    late = Recorder(tmp_path / "late")
+    late.mount()
+    late.drive()
+    late.clouds([0, 1, 3, 2, 4, 5, 6, 7], stamp=lambda stamp: stamp)
+    assert len(BagLog(late.close())) == 8
+
+
 def test_a_gap_splits_windows(tmp_path) -> None:
     bag = Recorder(tmp_path)
     bag.mount()
@@ -283,9 +314,11 @@ def test_a_gap_splits_windows(tmp_path) -> None:
         assert open_log("bags", bag.close()).gaps == {2}
 
 
-def test_clouds_in_the_frame_of_the_world_are_moved_to_the_odometry(tmp_path) -> None:
+@pytest.mark.parametrize("has_odometry", [True, False])
+def test_clouds_in_the_frame_of_the_world_are_moved_to_the_vehicle(tmp_path, has_odometry: bool) -> None:
     bag = Recorder(tmp_path)
-    bag.odometry("body", "camera_init")
+    if has_odometry:
+        bag.odometry("body", "camera_init")
     for k, stamp in enumerate(bag.stamps):
         bag.transform(stamp, "camera_init", "body", bag.recording.pose_at(stamp))
         T = bag.recording.pose_at(stamp)

@@ -219,3 +219,32 @@ def test_logs_of_one_name_are_told_apart(tmp_path: Path) -> None:
     assert [log.log_id for log in logs] == ["monday-run", "tuesday-run", "walk"]
     assert [source_name(source) for source in logs.sources] == ["monday-run", "tuesday-run", "walk"]
     assert cflow_torch.open(tmp_path / "monday", check=False).log_id == "run"
+
+
+@pytest.mark.parametrize(
+    ("clouds", "other"),
+    [
+        ("sensors/lidar", "poses.txt"),  # AV2
+        ("lidar", "lidar/poses.json"),  # PandaSet
+        ("points", "features.h5"),
+        ("points", "imu.bag"),
+        ("points", "sequence.json"),  # AevaScenes
+        ("velodyne_points", "poses.txt"),  # KITTI
+    ],
+)
+def test_folders_of_clouds_may_be_called_as_those_of_a_data_set(clouds: str, other: str, tmp_path: Path) -> None:
+    folder = tmp_path / "drive" / clouds
+    folder.mkdir(parents=True)
+    for number in range(2):
+        np.ones((9, 4), np.float32).tofile(folder / f"{number:06d}.bin")
+    (tmp_path / "drive" / other).write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2 if other == "poses.txt" else "[]")
+    assert recognise(tmp_path) == "arrays"
+    assert len(cflow_torch.open(tmp_path, check=False)) == 2
+
+
+def test_labels_and_boxes_are_no_logs(tmp_path: Path) -> None:
+    for place in ("scans", "labels", "annotations"):
+        (tmp_path / place).mkdir()
+        for number in range(2):
+            np.save(tmp_path / place / f"{number}.npy", np.ones((5, 3)))
+    assert find_sources("arrays", tmp_path) == [tmp_path / "scans"]

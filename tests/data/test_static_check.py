@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cflow_torch import CFlowError, Sweep
-from cflow_torch.data.arrays import write_array_log
+from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.deskewing import DeskewedLog
@@ -33,10 +33,9 @@ from cflow_torch.transforms import (
     to_quaternions,
     to_rotations,
     transform_points,
+    turn_of,
 )
 from cflow_torch.types import CFlowWarning
-
-MOUNTING = as_matrix(np.eye(3), (1.35, 0, 1.6))
 
 
 class Wrong(Log):
@@ -342,13 +341,14 @@ def test_poses_of_another_log_are_named(drive):
     assert judge_log(mixed).best == (NO_READING,) and "no reading" in find_problems(mixed)[0]
 
 
-@pytest.mark.parametrize("source", ["drive", "real"])
-def test_a_lidar_elsewhere_on_the_vehicle_shows_in_turns(source, request):
-    mixed = Wrong(request.getfixturevalue(source), poses=each(lambda pose: pose @ np.linalg.inv(MOUNTING)))
+@pytest.mark.parametrize(("source", "side"), [("drive", 0), ("real", 0), ("drive", 2)])
+def test_a_lidar_elsewhere_on_the_vehicle_shows_in_turns(source, side, request):
+    mounting = as_matrix(np.eye(3), (1.35, side, 1.6))
+    mixed = Wrong(request.getfixturevalue(source), poses=each(lambda pose: pose @ np.linalg.inv(mounting)))
     (place,) = re.findall(
         r"data.ego_T_lidar with a position of about x = (.*) m and y = (.*) m", find_problems(mixed)[0]
     )
-    assert np.hypot(float(place[0]) - 1.35, float(place[1])) < 0.4
+    assert np.hypot(float(place[0]) - 1.35, float(place[1]) - side) < 0.4
 
 
 def test_a_lidar_that_is_turned_and_elsewhere_is_located(turning):
@@ -759,10 +759,43 @@ def test_ground_masks_of_other_rows_and_of_all_points_are_recognised(request, so
     assert "empty, but the sweep contains ground" in text
 
 
-def test_poses_of_another_sensor_are_not_taken_for_other_axes_of_the_points(drive):
-    """Poses of LOAM (x left, y up, z forward), next to points with x forward."""
-    (problem,) = find_problems(Wrong(drive, poses=each(lambda pose: pose @ as_matrix(AXES["z_first"].T))))
-    assert "are of the points' frame (else give data.ego_T_lidar)" in problem and "data.read_as" not in problem
+def test_poses_of_the_lidar_are_told_from_those_of_the_vehicle(drive, tmp_path):
+    """As who corrects a tilted LiDAR with poses from its own odometry, which the check advises."""
+    tilt = as_matrix(rotations_about(1, np.radians(20)))
+    level = Wrong(drive, points=lambda points, _: transform_points(points, np.linalg.inv(tilt)), masks=False)
+    for name, poses in (("lidar", drive.poses @ tilt), ("ego", drive.poses)):
+        write_array_log(Wrong(level, poses=lambda _, poses=poses: poses, masks=False, name=name), tmp_path)
+        log = ArraysLog(tmp_path / name, ego_T_lidar=tilt)
+        assert np.allclose(log.poses, drive.poses, atol=1e-6)
+        assert any("poses are those of the LiDAR" in note for note in log.notes) == (name == "lidar")
+    sensor = ArraysLog(tmp_path / "ego", ego_T_lidar=tilt, poses_of="sensor")
+    assert np.allclose(sensor.poses, drive.poses @ tilt, atol=1e-6)
+    assert np.allclose(sensor.sweep(3).points, level.sweep(3).points, atol=1e-4), "the points stay"
+
+
+CAMERA_AHEAD = as_matrix(rotations_about(1, np.radians(8)) @ AXES[CAMERA], (1.2, 0.3, 0.4))
+INERTIAL_UNIT = as_matrix(rotations_about(2, np.radians(15)) @ rotations_about(1, np.radians(30)), (0.1, 0.05, -0.2))
+
+
+@pytest.mark.parametrize(
+    ("lidar_T_sensor", "axes"),
+    [
+        (as_matrix(AXES["z_first"].T), "left, up, ahead"),  # as of LOAM
+        (CAMERA_AHEAD, "right, down, ahead"),
+        (INERTIAL_UNIT, "ahead, left, up"),
+    ],
+    ids=["loam", "camera", "imu"],
+)
+def test_poses_of_another_sensor_are_named_with_its_axes_and_place(turning, lidar_T_sensor, axes):
+    """The points are right: nothing may be said of them."""
+    wrong = Wrong(turning, poses=each(lambda pose: pose @ lidar_T_sensor))
+    (problem,) = [text for text in find_problems(wrong) if "ground masks" not in text]
+    assert f"another sensor, whose x, y and z axes point {axes}" in problem and "data.read_as" not in problem
+    rotation = np.array(json.loads(re.search(r"rotation of about (\[\[.*?\]\])", problem)[1]))
+    assert np.degrees(turn_of(rotation @ lidar_T_sensor[:3, :3])) < 5
+    if lidar_T_sensor is CAMERA_AHEAD:
+        place = re.search(r"origin is at about x = (.*) m and y = (.*) m and z = (.*) m in", problem)
+        assert np.abs(np.linalg.inv(lidar_T_sensor)[[0, 2], 3] - (float(place[1]), float(place[3]))).max() < 0.8
 
 
 class Changed(LogWrapper):

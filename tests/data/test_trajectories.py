@@ -876,7 +876,7 @@ def test_clouds_of_a_second_sensor_are_said(tmp_path) -> None:
 
 
 def test_labels_and_maps_next_to_clouds_are_not_the_clouds(tmp_path) -> None:
-    for name in ("a_labels", "sweeps", "boxes"):
+    for name in ("a_labels", "sweeps", "dense"):
         clouds(tmp_path / name)
     for file in (tmp_path / "a_labels").iterdir():
         np.save(file, np.zeros(5, np.int32))
@@ -886,7 +886,7 @@ def test_labels_and_maps_next_to_clouds_are_not_the_clouds(tmp_path) -> None:
         np.save(tmp_path / f"{name}.npy", np.ones((2000, 3)))
     (tmp_path / "poses.txt").write_text("\n".join(EXACT))
     assert find_array_logs(tmp_path) == [tmp_path]
-    with pytest.warns(CFlowWarning, match="we read the clouds in sweeps; there are others in boxes, "):
+    with pytest.warns(CFlowWarning, match="we read the clouds in sweeps; there are others in dense, "):
         log: Any = ArraysLog(tmp_path)
     assert len(log) == len(log.poses) == 12 and {file.parent.name for file in log.files} == {"sweeps"}
 
@@ -991,3 +991,26 @@ def test_an_empty_first_cloud_and_a_folder_called_as_a_record_hide_no_log(tmp_pa
     for index in (1, 2):
         np.save(tmp_path / "drive" / f"{index}.npy", np.ones((30, 3)))
     assert find_array_logs(tmp_path) == [tmp_path / "drive"]
+
+
+@pytest.mark.parametrize("order", ["tq", "qt", "tq_w_first"])
+def test_poses_of_seven_numbers_in_json_are_read(tmp_path, order) -> None:
+    quaternion = to_quaternions(POSES[:, :3, :3])  # w first
+    quaternion = quaternion if order == "tq_w_first" else np.roll(quaternion, -1, 1)
+    parts = [quaternion, POSES[:, :3, 3]]
+    numbers = np.concatenate(parts if order == "qt" else parts[::-1], axis=1).tolist()
+    frames = [{"frame_id": f"sweep {k}", "pose": pose} for k, pose in enumerate(numbers)]
+    (tmp_path / "poses.json").write_text(
+        json.dumps({"calib": dict.fromkeys("ab", {"T": np.eye(4).tolist()}), "frames": frames})
+    )
+    assert np.allclose(poses_text.read_poses(tmp_path / "poses.json").poses, POSES)
+
+
+def test_quaternions_of_one_length_are_normalised(tmp_path) -> None:
+    table = np.concatenate([POSES[:, :3, 3], 1000 * np.roll(to_quaternions(POSES[:, :3, :3]), -1, 1)], axis=1)
+    np.savetxt(tmp_path / "poses.csv", table, "%.9f", ",", header="x,y,z,qx,qy,qz,qw", comments="")
+    assert np.allclose(poses_text.read_poses(tmp_path / "poses.csv").poses, POSES)
+    table[3, 3:] *= 2
+    np.savetxt(tmp_path / "poses.csv", table, "%.9f", ",", header="x,y,z,qx,qy,qz,qw", comments="")
+    with pytest.raises(CFlowError, match="not a rigid motion"):
+        poses_text.read_poses(tmp_path / "poses.csv")

@@ -28,6 +28,7 @@ POSE_FILES = (
 )
 """Names of files of poses that we prefer to others."""
 GROUND_FOLDER = "ground"
+_LABELS = {"labels", "label", "annotations", "boxes", "bboxes", "predictions"}  # names of folders without clouds
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
 # Words in names of files of poses near a log, or whole names of their folders.
@@ -53,8 +54,15 @@ def find_array_logs(root: PathLike) -> list[Path]:
     A log has two or more clouds of one suffix, see `_places`.
     """
     what = "a folder with one point cloud per file, or a folder of such"
-    is_log, is_passed = (lambda folder: bool(_places(folder))), (lambda child: child.name != GROUND_FOLDER)
-    return find_folders(as_path(root), is_log, SEARCH_DEPTH, what, is_passed=is_passed)
+    return find_folders(as_path(root), is_array_log, SEARCH_DEPTH, what, is_passed=_holds_no_labels)
+
+
+def is_array_log(folder: Path) -> bool:
+    return bool(_places(folder))
+
+
+def _holds_no_labels(folder: Path) -> bool:
+    return folder.name not in (GROUND_FOLDER, *_LABELS)
 
 
 def _places(folder: Path) -> list[tuple[Path, _Kinds]]:
@@ -72,7 +80,7 @@ def _places(folder: Path) -> list[tuple[Path, _Kinds]]:
         kinds = _larger(parent, fewest)
         if kinds:
             return [(parent, kinds), *passed_over]
-    below = {path: _larger(path, fewest) for path in sorted(visible(folder)) if path.name != GROUND_FOLDER}
+    below = {path: _larger(path, fewest) for path in sorted(filter(_holds_no_labels, visible(folder)))}
     below = {path: kinds for path, kinds in below.items() if kinds}
     if own and not below:
         return passed_over
@@ -234,7 +242,7 @@ def find_pose_files(folder: Path, clouds: Container[Path] = ()) -> list[Path]:
     Files that are called as poses (`POSE_FILES`) need no test.
     """
     poses = [path for path in _tables(folder, clouds) if path.name in POSE_FILES or _have_poses(path)]
-    for path in sorted(path for path in visible(folder) if path.is_dir()):
+    for path in sorted(path for path in visible(folder) if path.is_dir() and _holds_no_labels(path)):
         files = files_of_poses(path)
         poses += [path] if len(files) > 1 and _has_one_pose(files[0]) else []
     return poses
@@ -247,7 +255,7 @@ def _have_poses(path: Path) -> bool:
 
 def find_poses(
     folder: Path,
-    clouds: Container[Path],
+    clouds: Sequence[Path],
     times_ns: Sequence[int] | None,
     fits: Callable[[Trajectory], bool],
     tell: Callable[[str], None],
@@ -256,7 +264,7 @@ def find_poses(
 
     Args:
         folder: its folder.
-        clouds: files that hold no poses.
+        clouds: files that hold no poses, whose folder may hold some, too.
         times_ns: of its sweeps; None = unknown.
         fits: tests whether poses belong to the sweeps.
         tell: is called with what the user should know.
@@ -266,7 +274,8 @@ def find_poses(
         name. If several are left in the folder, that is a `CFlowError`; near it, none is used. A text in the folder of
         a log is returned if nothing fits, because it should.
     """
-    own = find_pose_files(folder, clouds)
+    folders = dict.fromkeys([folder, *(path.parent for path in clouds[:1])])
+    own = [path for each in folders for path in find_pose_files(each, clouds)]
     top = folder.resolve()
     kitti = top.parent.parent / "poses" / f"{top.name}.txt"
     called = [path for path in own if path.name in POSE_FILES]

@@ -24,7 +24,7 @@ from cflow_torch.data.folders import natural_key, visible
 from cflow_torch.data.npy_file import parse_npy
 from cflow_torch.data.paths import PathLike, as_path, read_bytes, suffix_of
 from cflow_torch.data.trajectory import Trajectory, checked_poses, positions_of_degrees
-from cflow_torch.transforms import as_matrix, poses_from_quaternions, rotations_of
+from cflow_torch.transforms import ROUNDING, as_matrix, poses_from_quaternions, rotations_of
 from cflow_torch.types import CFlowError
 
 _POSITION, _ANGLES = ("x", "y", "z"), ("roll", "pitch", "yaw")
@@ -99,13 +99,16 @@ def parse_poses(content: bytes, path: Path) -> Trajectory:
     if suffix_of(path) not in STRUCTURED:
         return _poses_of_table(parse_table(content, path), path)
     error = CFlowError(f"{path} has no list of poses: matrices of 16 or 12 numbers, or positions and rotations")
+    found = []
     for table in tables_of_values(content, path):
         if _roles(table.names):
             try:
-                return _poses_of_table(table, path)
+                found.append(_poses_of_table(table, path))
             except CFlowError as problem:
                 error = problem
-    raise error
+    if not found:
+        raise error
+    return max(found, key=lambda each: len(each.poses))  # ties: the outer one; calibrations have fewer
 
 
 def poses_of_members(members: Sequence[Mapping[str, object]]) -> Trajectory | None:
@@ -227,6 +230,9 @@ def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.
         values.update(zip(_QUATERNION if q2 < q0 else _TUM[4:], (values[f"q{k}"] for k in range(4))))
     if set(_QUATERNION) <= set(values):
         quaternions = np.stack([values[name] for name in _QUATERNION], axis=1)
+        length: np.ndarray = np.linalg.norm(quaternions, axis=1)
+        if len(length) > 1 and np.ptp(length) < ROUNDING * length.min():  # integers, or rounded
+            quaternions = quaternions / length[:, None]
         return poses_from_quaternions(positions, quaternions, lambda row: f"{path}: pose {row}")
     angles = np.stack([values.get(name, zeros) for name in _ANGLES])
     are_degrees = np.abs(angles).max() > 2 * np.pi

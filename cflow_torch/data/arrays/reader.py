@@ -28,6 +28,7 @@ from cflow_torch.data.calibration import CAMERA_KEYS, read_calibration, transfor
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.log import Log
+from cflow_torch.data.log_motion import fits_better
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, read_bytes, read_start, stem_of, suffix_of
 from cflow_torch.data.point_times import find_times
@@ -52,7 +53,8 @@ class ArraysLog(Log):
             folder there whose contents are poses, or VIEWPOINT of `.pcd` files if it is set, or those in arrays of
             each `.npz` file, or the only file of text in a folder near this one that has poses at the unix times of the
             sweeps; None = no poses; or a file (see `read_poses`); or a (K, 4, 4) array.
-        poses_of: "ego" or "lidar", the frame whose poses these are.
+        poses_of: whose poses these are: "ego", "lidar", or "sensor" = of another sensor: `ego_T_lidar` then maps to it,
+            and the points stay. "auto" = of the LiDAR if the static world then stands still clearly better, else "ego".
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
         times: "auto" = times.txt in the folder, or see `timestamps`; None = none; or a file with one time per sweep.
@@ -87,7 +89,7 @@ class ArraysLog(Log):
         self,
         folder: PathLike,
         poses: Any = "auto",
-        poses_of: str = "ego",
+        poses_of: str = "auto",
         calibration: PathLike | None = "auto",
         times: PathLike | None = "auto",
         ground: PathLike | None = "auto",
@@ -96,8 +98,8 @@ class ArraysLog(Log):
         bin_columns: int | str = "auto",
     ) -> None:
         self.folder = as_path(folder)
-        if poses_of not in ("ego", "lidar"):
-            raise CFlowError(f"poses_of={poses_of!r}: pass 'ego' or 'lidar'")
+        if poses_of not in ("auto", "ego", "lidar", "sensor"):
+            raise CFlowError(f"poses_of={poses_of!r}: pass 'auto', 'ego', 'lidar' or 'sensor'")
         if bin_columns != "auto" and (type(bin_columns) is not int or bin_columns < 3):
             raise CFlowError(f"bin_columns={bin_columns!r}: pass 'auto' or an integer of at least 3")
         self.log_id = self.folder.resolve().name
@@ -109,12 +111,12 @@ class ArraysLog(Log):
             self._note(f"we read the clouds in {self.files[0].parent.name}; there are others in {', '.join(others)}")
         self._ground = resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
-        self.lidar_position = self.ego_T_lidar[:3, 3]
+        self.lidar_position = np.zeros(3) if poses_of == "sensor" else self.ego_T_lidar[:3, 3]
         stated, file_of_times = self._stated_times(times), None
         stamps = stated
         if stated is None and times == "auto":
             stamps, file_of_times = self._tabled_times()
-        trajectory, are_of_lidar = self._trajectory(poses, calibration, stamps)
+        trajectory, poses_of = self._trajectory(poses, poses_of, calibration, stamps)
         counted = None if trajectory is None else trajectory.counted(stated).times_ns
         if stated is None and counted is not None and len(counted) == len(self.files):
             stamps = counted.tolist()
@@ -122,9 +124,9 @@ class ArraysLog(Log):
             self._note(f"the times of its sweeps are those of {file_of_times.name}")
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
-        if trajectory is not None and (are_of_lidar or poses_of == "lidar"):
-            trajectory = trajectory._replace(poses=trajectory.poses @ np.linalg.inv(self.ego_T_lidar))
-        self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
+        self.poses = None if trajectory is None else self._pose_per_sweep(self._of_ego(trajectory, poses_of), stamps)
+        if poses_of == "auto" and ego_T_lidar is not None and self.poses is not None:
+            self._ask_whose_poses()
         self.gaps |= frozenset(self._gaps_in_numbers())
         self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAYS))
         if trajectory is not None and self.has_viewpoints:
@@ -176,10 +178,12 @@ class ArraysLog(Log):
             self._note(f"its .bin files look like {layout}; data.bin_columns sets another number")
         return layout
 
-    def _trajectory(self, poses: Any, calibration: Any, stamps: Sequence[int] | None) -> tuple[Trajectory | None, bool]:
-        """Return the poses, and whether a calibration converted them to the LiDAR's."""
+    def _trajectory(
+        self, poses: Any, poses_of: str, calibration: Any, stamps: Sequence[int] | None
+    ) -> tuple[Trajectory | None, str]:
+        """Return the poses, and whose they are: of the LiDAR if a calibration converted them, else as given."""
         if poses is not None and not is_path_like(poses):
-            return Trajectory(checked_poses(np.asarray(poses), "poses"), None, False, "poses"), False
+            return Trajectory(checked_poses(np.asarray(poses), "poses"), None, False, "poses"), poses_of
         if poses == "auto":
             found = find_poses(self.folder, self.files, stamps, partial(self._fits, stamps), self._note)
             trajectory = found or self._viewpoints()
@@ -187,15 +191,15 @@ class ArraysLog(Log):
             file = resolve(self.folder, poses, (), "poses")
             trajectory = None if file is None else poses_text.read_poses(file)
         if trajectory is None:
-            return None, False
+            return None, poses_of
         chosen = resolve(self.folder, calibration, ("calib.txt",), "calibration")
         if chosen is None or (calibration == "auto" and not trajectory.is_kitti):
-            return trajectory, False
+            return trajectory, poses_of
         values = read_calibration(chosen)
         if calibration == "auto" and values.keys().isdisjoint(CAMERA_KEYS):
             fix = "if they are KITTI's poses of a camera, download data_odometry_calib.zip, which has it"
             self._note(f"{chosen.name} has no Tr, so we take the poses for those of the LiDAR: {fix}")
-            return trajectory, False
+            return trajectory, poses_of
         T_cam_lidar = transform(values, chosen, *CAMERA_KEYS)
         converted = np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar
         if calibration == "auto" and _drives_along_x(trajectory.poses) and not _drives_along_x(converted):
@@ -203,8 +207,30 @@ class ArraysLog(Log):
                 f"{trajectory.source} has poses that drive along x, the LiDAR's axis ahead, not along z, the camera's. "
                 f"So we take them for poses of the LiDAR, and ignore Tr of {chosen.name}"
             )
-            return trajectory, True
-        return trajectory._replace(poses=converted), True
+            return trajectory, "lidar"
+        return trajectory._replace(poses=converted), "lidar"
+
+    def _of_ego(self, trajectory: Trajectory, poses_of: str) -> Trajectory:
+        """Return the poses of the ego frame. If poses are of another sensor, it is the LiDAR's."""
+        if poses_of == "lidar":
+            return trajectory.seen_from(np.linalg.inv(self.ego_T_lidar))
+        if poses_of == "sensor":
+            trajectory = trajectory.seen_from(self.ego_T_lidar)
+            self.ego_T_lidar = np.eye(4)
+        return trajectory
+
+    def _ask_whose_poses(self) -> None:
+        """Take the poses for those of the LiDAR if the static world then stands still clearly better."""
+        lidar_T_ego = np.linalg.inv(self.ego_T_lidar)
+        others = np.asarray(self.poses) @ lidar_T_ego
+        try:
+            are_of_lidar = fits_better(self, others)
+        except (CFlowError, OSError):  # `sweep` raises the error of the sweep that cannot be read
+            return
+        if are_of_lidar:
+            self._note("its poses are those of the LiDAR. data.poses_of=lidar does the same without this line")
+            self.poses = others
+            self.trajectory = self.trajectory and (self.trajectory[0], self.trajectory[1] @ lidar_T_ego)
 
     def _fits(self, stamps: Sequence[int] | None, trajectory: Trajectory) -> bool:
         """Test whether poses may be those of the sweeps: by their times, their labels or their number."""

@@ -18,6 +18,7 @@ from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.paths import read_bytes, suffix_of
+from cflow_torch.transforms import ROUNDING
 
 _FEWEST_NUMBERS = 7  # of a pose
 COMMENTS = ("#", "%", "//")
@@ -25,6 +26,7 @@ COMMENTS = ("#", "%", "//")
 MATRIX = tuple(f"m{k}" for k in range(16))
 """Names of the entries of a matrix, row by row or column by column; the last four may be missing."""
 # Numbers in a list of a JSON file, and the role that the name of the list has -> endings of their names, else 0, 1, ...
+_PLACE, _FOUR = ("x", "y", "z"), ("q0", "q1", "q2", "q3")  # of lists of seven; w is the first of four or the last
 _VECTORS: dict[Any, Sequence[Any]] = {(3, "x"): ("x", "y", "z"), (3, "qx"): ("roll", "pitch", "yaw")}
 
 
@@ -199,12 +201,20 @@ def _numbers_of(value: Any, name: str) -> Iterator[tuple[str, str]]:
     if isinstance(value, Decimal):
         yield name, str(value)
     elif numbers:
+        starts = [k for k in (3, 0) if len(numbers) == 7 and _is_unit(numbers[k : k + 4])]
+        if starts:
+            yield from zip((*_PLACE, *_FOUR) if starts[0] else (*_FOUR, *_PLACE), map(str, numbers))
+            return
         kind = len(numbers), role_of_name(f"{name}.x")
         ends = MATRIX if len(numbers) in (12, 16) else _VECTORS.get(kind, range(len(numbers)))
         yield from ((f"{name}.{end}".lstrip("."), str(number)) for end, number in zip(ends, numbers))
     elif isinstance(value, dict):
         for key, member in value.items():
             yield from _numbers_of(member, f"{name}.{key}" if name else key)
+
+
+def _is_unit(numbers: Sequence[Decimal]) -> bool:
+    return bool(abs(np.linalg.norm(np.array(numbers, np.float64)) - 1) < ROUNDING)
 
 
 def _text_of(value: Any) -> str:

@@ -14,6 +14,8 @@ from cflow_torch.types import CFlowError
 from cflow_torch.windows.returns import missing_returns
 
 _CONSTANT = 1e-9  # metres, and entries of a rotation: the change of a constant transform by rounding
+BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up
+_SLIGHTLY_TILTED = 0.004  # 1 - cosine of 5 degrees
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype
 
 
@@ -119,17 +121,31 @@ class Frames:
         return child in self._samples and len(self._link(child)[0]) > 1
 
     def world_of(self, frame: str) -> str:
-        """Return the frame in which the path of a frame is continuous: its root, or the one below corrections.
-
-        A localisation corrects odometry by a transform (map to odom) that jumps now and then, and is constant between.
-        """
+        """Return the frame in which the path of a frame is continuous: its root, or the one below corrections."""
         moving = [child for child in self.chain(frame)[:-1] if self.is_moving(child)]
-        for child in moving[1:]:
-            poses = self._link(child)[1]
-            is_constant = np.abs(np.diff(poses, axis=0)).max(axis=(1, 2)) < _CONSTANT
-            if child.split("/")[-1] == "odom" or is_constant.mean() > 0.5:
-                return child
-        return self.chain(frame)[-1]
+        return next(filter(self._is_corrected, moving[1:]), self.chain(frame)[-1])
+
+    def _is_corrected(self, child: str) -> bool:
+        """Test whether the transform to a frame are corrections: it jumps now and then, and is constant between."""
+        changes = np.abs(np.diff(self._link(child)[1], axis=0)).max(axis=(1, 2))
+        return child.split("/")[-1] == "odom" or bool((changes < _CONSTANT).mean() > 0.5)
+
+    def vehicle_of(self, frame: str) -> str:
+        """Return the frame of the vehicle that carries a frame, or that drives in it; "" = none is known.
+
+        It is base_link. Else, of the frames from the given one to the moving one that carries it, it is the first whose
+        z axis points up. If none moves, the given one may be that of the world: then it is the only moving one in it.
+        """
+        chain = self.chain(frame)
+        bases = [each for each in (*chain, *self._samples) if each.split("/")[-1] == BASE]
+        base = next((each for each in bases if self.are_joined(each, frame)), "")
+        moving = [child for child in chain if self.is_moving(child)]
+        inside = [child for child in self._samples if frame in self.chain(child)[1:] and self.is_moving(child)]
+        if base or not moving or (inside and self._is_corrected(moving[0])):
+            return base or (inside[0] if len(inside) == 1 else "")
+        carrying = chain[: chain.index(moving[0]) + 1]
+        up = [float(self.in_root(each, self._link(moving[0])[0])[:, 2, 2].mean()) for each in carrying]
+        return next(each for each, share in zip(carrying, up) if share >= max(up) - _SLIGHTLY_TILTED)
 
     def between(self, target: str, source: str, times_ns: np.ndarray) -> np.ndarray:
         """Return (K, 4, 4) float64 `T_target_source` at the times. Frames that are not connected are a `CFlowError`."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from cflow_torch.data.arrays.folder import find_poses_near
 from cflow_torch.data.arrays.poses_text import read_poses
-from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, is_pose, points_of, sample, sorted_poses
+from cflow_torch.data.bags.messages import BASE, Frames, Sample, cloud_columns, is_pose, points_of, sample, sorted_poses
 from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import search, visible
 from cflow_torch.data.log import Log
@@ -51,9 +51,9 @@ _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by less
 _LARGEST_DELAY = 500_000_000  # nanoseconds by which messages arrive later than others
 _EARLY = 100_000_000  # nanoseconds; a message that arrives so long before its time has another clock than the recorder
+_SLOWEST, _AROUND = 1000, 3  # times by which arrivals grow more than stamps; clouds around a fall of the stamps
 _NEED = "bags need rosbags (extra bags): pip install rosbags"
 _LOST = "{} that are NaN or zeros are left out"
-_BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up
 
 
 def find_bags(root: PathLike) -> list[Path]:
@@ -78,14 +78,15 @@ class BagLog(Log):
             PoseWithCovarianceStamped; a file of poses of the ego frame with times (TUM); None = no poses; "auto" = the
             first available of: transforms in which the ego frame moves, the only topic of these types, the only file in
             a folder near the bag that has poses at the times of the clouds, none.
-        frame: name of the ego frame; None = base_link if transforms connect it to the LiDAR, else the LiDAR's own.
+        frame: name of the ego frame; None = the vehicle that carries the LiDAR or drives in the frame of the clouds,
+            see `Frames.vehicle_of`, else the LiDAR's own.
         ego_T_lidar: (4, 4), maps the frame of the clouds to the ego frame; None = from the transforms.
 
     Attributes:
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
         trajectory: times and `T_world_ego` of all transforms or messages, by which `DeskewedLog` moves points.
-        timestamps: nanoseconds from the header of each cloud (if that is 0, from its arrival). Clouds before the first
-            or after the last pose are left out.
+        timestamps: nanoseconds from the header of each cloud, unless arrivals contradict them, see `_timed`. Clouds
+            before the first or after the last pose are left out.
         topic, frame: the settings in use.
 
     Convention: points are in the ego frame, as measured (`open_log` de-skews them). Poses are interpolated at the time
@@ -122,10 +123,9 @@ class BagLog(Log):
         with file_errors(f"{self.path}", hint):
             topics = {connection.topic: connection.msgtype for connection in self._reader().connections}
             self.topic = self._cloud_topic(topics, topic)
-            self._shift = 0  # nanoseconds from the header of a cloud to its time
-            self._arrival, tracks = self._scan()
+            self._clouds, tracks = self._scan()
             self.frame = frame or self._ego_frame()
-            self.timestamps = sorted(self._arrival)
+            self.timestamps = sorted(self._clouds)
             self._check_count(f"{self.path}: {self.topic}")
             trajectory = self._find_poses(topics, poses, tracks)
             if trajectory is not None:
@@ -208,7 +208,7 @@ class BagLog(Log):
     def _timed_cloud(self, time: int) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Read a cloud and the (N,) seconds of its points; None = unknown. We leave out points of stray times."""
         columns = self._cloud(time)
-        times = find_times(columns, time - self._shift, self._period, points_of(columns), self._note)
+        times = find_times(columns, time - self._clouds[time][1], self._period, points_of(columns), self._note)
         if times is None or times.seconds is None:
             return columns, None
         kept = ~times.is_stray
@@ -261,31 +261,30 @@ class BagLog(Log):
     def _ego_frame(self) -> str:
         """Return the frame of the vehicle. Without transforms to the LiDAR, it is the LiDAR's own."""
         frames, lidar = self._frames, self._lidar
-        if self._mount is not None and len(frames.change_times(_BASE)) > 1:
-            return _BASE
-        if frames.are_joined(_BASE, lidar):
-            return _BASE
-        if len(frames.change_times(lidar)) < 2:
-            moving = [child for child in self._child.values() if frames.is_moving(child)]
-            if len(moving) == 1 and frames.are_joined(moving[0], lidar):  # an odometry that publishes registered clouds
-                self._note(f"its clouds are in {lidar}, the frame of the world; we move them to {moving[0]}")
-                return moving[0]
-        named = [name for name in (_BASE, *self._child.values()) if name and not frames.are_joined(name, lidar)]
-        for name in named if self._mount is None else []:
+        vehicle = frames.vehicle_of(lidar)
+        if vehicle:
+            if lidar in frames.chain(vehicle)[1:]:  # an odometry that publishes registered clouds
+                self._note(f"its clouds are in {lidar}, the frame of the world; we move them to {vehicle}")
+            return vehicle
+        for name in filter(None, (BASE, *self._child.values())):
             is_in_tf = len(frames.change_times(name)) > 1
-            if is_in_tf or name in self._child.values():
+            if (
+                self._mount is None
+                and not frames.are_joined(name, lidar)
+                and (is_in_tf or name in self._child.values())
+            ):
                 self._note(
                     f"no transform connects its LiDAR ({lidar}) to {name}, whose poses it has. We assume that both are "
                     "in one place; pass the mounting of the LiDAR, ego_T_lidar (data.ego_T_lidar)",
                     "missing link",
                 )
             if is_in_tf:
-                self._mount = np.eye(4)
+                self._mount = np.eye(4) if self._mount is None else self._mount
                 return name
         return lidar
 
-    def _scan(self) -> tuple[dict[int, int], dict[str, list[Any]]]:
-        """Read all messages once. Return the arrival time of each cloud and the pose samples of each topic."""
+    def _scan(self) -> tuple[dict[int, tuple[int, int]], dict[str, list[Any]]]:
+        """Read all messages once. Return the clouds (see `_timed`) and the pose samples of each topic."""
         self._lidar = ""
         self._child: dict[str, str] = {}
         self._pose_delays: list[int] = []  # nanoseconds from the times of poses and transforms to their arrival
@@ -301,7 +300,7 @@ class BagLog(Log):
                 frame = _frame_of(message)
                 self._lidar = self._lidar or frame
                 if frame == self._lidar:
-                    stamps.append((_stamp(message, 0), arrived))
+                    stamps.append((_stamp(message), arrived))
                 else:
                     self._note(f"its clouds are of several sensors: we read those in {self._lidar}, not in {frame}")
             elif connection.msgtype in _TF_TYPES:
@@ -309,11 +308,11 @@ class BagLog(Log):
             else:
                 self._add_poses(connection.topic, message, arrived, tracks)
         self._frames = Frames(links)
-        ignored = self._frames.ignored(self._lidar, _BASE)
+        ignored = self._frames.ignored(self._lidar, BASE)
         self._note(
             f"frames have several parents: we ignore the transforms that are rarer, {ignored}" if ignored else ""
         )
-        return self._arrivals(stamps), tracks
+        return self._timed(stamps), tracks
 
     def _add_transforms(self, message: Any, arrived: int, links: dict[tuple[str, str], list[Sample]]) -> None:
         """Add the transforms of a message to the samples of each parent and frame."""
@@ -322,7 +321,7 @@ class BagLog(Log):
             if not is_pose(pose):
                 self._note(_LOST.format("transforms"))
                 continue
-            self._pose_delays.append(arrived - _stamp(link, arrived))
+            self._pose_delays.append(arrived - int(pose[0]))
             links.setdefault((_frame_of(link), link.child_frame_id.lstrip("/")), []).append(pose)
 
     def _add_poses(self, topic: str, message: Any, arrived: int, tracks: dict[str, list[Sample]]) -> None:
@@ -338,22 +337,34 @@ class BagLog(Log):
         self._pose_delays.append(arrived - int(poses[-1][0]))
         self._child[topic] = getattr(message, "child_frame_id", "").lstrip("/")
 
-    def _arrivals(self, stamps: list[tuple[int, int]]) -> dict[int, int]:
-        """Return the time of each cloud and its arrival, from header stamps and arrivals. We say if stamps repeat."""
-        count = len({stamp for stamp, _ in stamps})
-        # Of neighbours that arrive one after the other; clouds that are played twice have other neighbours.
-        num_equal = sum(a[0] == b[0] and a[1] < b[1] for a, b in zip(stamps, stamps[1:]))
-        self._use_arrival = num_equal > max(len(stamps) // 2 - 1, 0)
-        if self._use_arrival:
-            stamps = [(arrived, arrived) for _, arrived in stamps]
+    def _timed(self, stamps: list[tuple[int, int]]) -> dict[int, tuple[int, int]]:
+        """Return the arrival of each cloud by its time, and by how much the time differs from the stamp.
+
+        Stamps that hardly grow from one arrival to the next are replaced by the arrivals. If they fall, a clock was set
+        back, and we let it run on. We say both.
+
+        Args:
+            stamps: of each cloud, that of its header and its arrival, in the order of arrival.
+        """
+        is_same = [abs(b[0] - a[0]) < (b[1] - a[1]) / _SLOWEST for a, b in zip(stamps, stamps[1:])]
+        if sum(is_same) > max(len(stamps) // 2 - 1, 0):
+            count = len(stamps) - sum(is_same)
             self._note(f"its {len(stamps)} clouds have {count} different time stamps, so we use their times of arrival")
-        stamps = [(stamp or arrived, arrived) for stamp, arrived in stamps]
-        repeated = len(stamps) - len(dict(stamps))
-        if repeated:
-            self._note(
-                f"{repeated} clouds repeat the time stamp of an earlier one and are left out; was it played twice?"
-            )
-        return dict(reversed(stamps))
+            return {arrived: (arrived, arrived - stamp) for stamp, arrived in stamps}
+        first = list(dict(reversed(stamps)).items())[::-1]  # clouds that are played twice repeat their stamps
+        if len(first) < len(stamps):
+            count = len(stamps) - len(first)
+            self._note(f"{count} clouds repeat the time stamp of an earlier one and are left out; was it played twice?")
+        delay = [arrived - stamp for stamp, arrived in first]
+        shift = np.zeros(len(first), np.int64)
+        for k in range(_AROUND, len(first) - _AROUND + 1):
+            before, after = sorted(delay[k - _AROUND : k]), sorted(delay[k : k + _AROUND])
+            jump, spread = after[0] - before[-1], max(after[-1] - after[0], before[-1] - before[0])
+            if first[k][0] < first[k - 1][0] and jump > spread:  # else messages arrived late
+                back = _middle(after) - _middle(before)
+                shift[k:] += back
+                self._note(f"the clock of its clouds was set back by {back * 1e-9:.3g} s, so we add that to later ones")
+        return {stamp + by: (arrived, by) for (stamp, arrived), by in zip(first, shift.tolist())}
 
     def _set_clock(self, pose_times: np.ndarray) -> None:
         """Shift the times of clouds to the clock of the poses, by the times of arrival, if the clocks surely differ.
@@ -362,7 +373,7 @@ class BagLog(Log):
         may arrive late, because they take long to compute.
         """
         first, last = self.timestamps[0], self.timestamps[-1]
-        delays = [arrived - time for time, arrived in self._arrival.items()], self._pose_delays
+        delays = [arrived - time for time, (arrived, _) in self._clouds.items()], self._pose_delays
         shift = _middle(delays[0]) - _middle(delays[1])
         do_overlap = last >= pose_times[0] and first <= pose_times[-1]
         if abs(shift) < (_LARGEST_DELAY if do_overlap else _ANOTHER_CLOCK):
@@ -372,9 +383,8 @@ class BagLog(Log):
         if do_overlap and sum(are_early) != 1:
             self._note(f"clocks of its clouds and poses differ by {seconds}: if static points move, correct one")
             return
-        self._shift = shift
-        self._arrival = {time + shift: arrived for time, arrived in self._arrival.items()}
-        self.timestamps = sorted(self._arrival)
+        self._clouds = {time + shift: (arrived, by + shift) for time, (arrived, by) in self._clouds.items()}
+        self.timestamps = sorted(self._clouds)
         self._note(
             f"the times of its clouds and of its poses have different clocks ({seconds}), so we shift those of the "
             "clouds"
@@ -382,6 +392,7 @@ class BagLog(Log):
 
     def _find_trajectory(self, poses: str, tracks: dict[str, list[Any]]) -> tuple[np.ndarray, np.ndarray]:
         """Return (M,) int64 times of transforms or messages, and (M, 4, 4) `T_world_ego` at these times."""
+        child = self._child.get(poses, "") if poses != "tf" else self.frame
         if poses == "tf":
             times, world = self._frames.change_times(self.frame), self._frames.world_of(self.frame)
             matrices = self._frames.between(world, self.frame, times)
@@ -392,9 +403,10 @@ class BagLog(Log):
                 )
         else:
             times, matrices = sorted_poses(tracks.get(poses, []), poses)
-            child = self._child.get(poses, "")
-            if child and self._frames.are_joined(child, self.frame):
-                matrices = matrices @ self._frames.between(child, self.frame, times)
+        if child and self._frames.are_joined(child, self.frame):
+            matrices = matrices @ self._frames.between(child, self.frame, times)
+            if self._mount is not None and self.frame == self._lidar:
+                matrices = matrices @ np.linalg.inv(self._mount)
         if len(times) < 2:
             raise CFlowError(f"poses={poses}: fewer than two poses of {self.frame}; choose others, or poses=null")
         return times, matrices
@@ -402,12 +414,11 @@ class BagLog(Log):
     def _cloud(self, time: int) -> dict[str, np.ndarray]:
         """Read the `cloud_columns` of the cloud at a time."""
         with file_errors(f"{self.path}, {self.topic} at {time} ns"):
-            reader, arrived = self._reader(), self._arrival[time]
+            reader, (arrived, shift) = self._reader(), self._clouds[time]
             clouds = [connection for connection in reader.connections if connection.topic == self.topic]
             for connection, _, data in reader.messages(clouds, start=arrived, stop=arrived + 1):
                 message = reader.deserialize(data, connection.msgtype)
-                is_at_time = self._use_arrival or _stamp(message, arrived) + self._shift == time
-                if is_at_time and _frame_of(message) == self._lidar:
+                if _stamp(message) + shift == time and _frame_of(message) == self._lidar:
                     return cloud_columns(message)
             raise CFlowError("the cloud is gone; was the bag changed?")
 
@@ -425,10 +436,10 @@ def _middle(values: list[int]) -> int:
     return sorted(values)[len(values) // 2] if values else 0
 
 
-def _stamp(message: Any, arrived: int) -> int:
-    """Return the time of a header in nanoseconds; if it is 0, the time of arrival."""
+def _stamp(message: Any) -> int:
+    """Return the time of a header in nanoseconds."""
     stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or arrived
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def _frame_of(message: Any) -> str:
@@ -438,9 +449,9 @@ def _frame_of(message: Any) -> str:
 def _pose_of(message: Any, arrived: int) -> Sample:
     """Return the pose of an Odometry, a PoseStamped, a PoseWithCovarianceStamped or a TransformStamped."""
     if hasattr(message, "transform"):
-        return sample(_stamp(message, arrived), message.transform.translation, message.transform.rotation)
+        return sample(_stamp(message) or arrived, message.transform.translation, message.transform.rotation)
     pose = getattr(message.pose, "pose", message.pose)
-    return sample(_stamp(message, arrived), pose.position, pose.orientation)
+    return sample(_stamp(message) or arrived, pose.position, pose.orientation)
 
 
 def _driven(message: Any, arrived: int) -> list[Sample]:

@@ -81,7 +81,7 @@ class HDF5Log(Log):
         with scene_errors(self.file):
             self._names = sweep_names(self._scene)
             self.timestamps = sorted(self._names)
-        self._check_count(self.file)
+        self._check_count(f"{self.file} (with a group for each sweep, called by its time, which holds lidar)")
         self.is_compensated = is_argoverse2(self.timestamps[0])
         if isinstance(ego_T_lidar, str) and ego_T_lidar == "auto":
             ego_T_lidar = self._stated_extrinsics()

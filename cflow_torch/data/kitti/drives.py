@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import NamedTuple, Sequence
 
-from cflow_torch.data.folders import search
+from cflow_torch.data.folders import search, visible
 from cflow_torch.data.paths import PathLike, as_path
 
 _DEEPEST = 6  # levels below the root; <root>/kitti/raw/<date>/<drive> has four
-_FRAME = re.compile(r"[0-9]{6}|[0-9]{10}")  # names of clouds without .bin
 
 
 class KITTIDrive(NamedTuple):
@@ -53,7 +51,7 @@ def find_kitti_drives(root: PathLike) -> list[KITTIDrive]:
 def _drives_of(folder: Path) -> list[KITTIDrive]:
     """Return the drive whose folder this is, or the drives of a tracking set."""
     for raw in (folder / "velodyne_points" / "data", folder / "velodyne_points"):
-        if _has_clouds(raw, (".bin", ".txt")):
+        if _has_clouds(raw, (".bin", ".txt"), digits=(10,)):
             return [KITTIDrive(folder, raw, "raw", folder.resolve().name)]
     clouds = folder / "velodyne"
     if not clouds.is_dir():
@@ -66,7 +64,6 @@ def _drives_of(folder: Path) -> list[KITTIDrive]:
     return [KITTIDrive(folder, drive, "tracking", drive.name) for drive in drives]
 
 
-def _has_clouds(folder: Path, suffixes: Sequence[str] = (".bin",)) -> bool:
-    if not folder.is_dir():
-        return False
-    return any(path.suffix in suffixes and _FRAME.fullmatch(path.stem) for path in folder.iterdir())
+def _has_clouds(folder: Path, suffixes: Sequence[str] = (".bin",), digits: Sequence[int] = (6, 10)) -> bool:
+    stems = (path.stem for path in visible(folder) if path.suffix in suffixes)
+    return any(stem.isdigit() and len(stem) in digits for stem in stems)
