@@ -10,8 +10,8 @@ sweep. There, we compare the motion with copies of it, displaced by 0.4 m.
 If the copies explain the sweeps as well, two kinds of objects have no margin: a line may be a rail, which beams hit at
 positions that move with the vehicle; and with history, a large surface that loses a few slices stays where it is.
 
-A table tells how often objects of a margin, a speed, a distance and a height move (docs/verified.md). If they hardly
-ever do, the object is static. Most tall objects with a small margin are trees and buildings.
+A table tells how often objects of a margin, a speed and a distance move (docs/verified.md). If they hardly ever do, the
+object is static.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from cflow_torch.verified.columns import Pixels
 from cflow_torch.verified.comparisons import count_in_place
 from cflow_torch.verified.component_tree import Tree
 from cflow_torch.verified.confidence import TABLE, Bins, bin_of
-from cflow_torch.verified.height_slices import HIGHEST_LAYER, HeightSlicedSweeps
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.paired_test import Counts, count_wins
 from cflow_torch.verified.rigid_motion import RigidMotion
 from cflow_torch.verified.selection import Objects
@@ -39,7 +39,6 @@ _COPIES_Z = 1.0  # standard deviations of noise by which a motion must exceed it
 # P(moving) of slow and fast objects, in pairs, then with history; an object that is less likely to move is static. A
 # wrong motion of a fast object is a large error.
 _LEAST_LIKELY = (0.05, 0.15, 0.02, 0.04)
-_LAYERS = 5  # between the lowest and the highest point of a tall object, in all sweeps: people and cars have fewer
 
 
 class MotionMargin(NamedTuple):
@@ -61,20 +60,11 @@ def motion_margin(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigi
     is_far = rigid.centre.square().sum(1) >= float(TABLE["far"]) ** 2
     has_history = sweeps.has_history.index_select(0, objects.window)
     margin = _margins(sweeps, tree, objects, rigid, is_fast)
-    row = 8 * has_history + 4 * _are_tall(sweeps, objects, rigid) + 2 * is_far + is_fast
-    bins = Bins.moving + row * Bins.num_margins + bin_of(margin, TABLE["margin"])
+    bins = Bins.moving + (4 * has_history + 2 * is_far + is_fast) * Bins.num_margins + bin_of(margin, TABLE["margin"])
 
     moving = constant(tuple(TABLE["moving"]), torch.float32, bins.device).index_select(0, bins)
     least = constant(_LEAST_LIKELY, torch.float32, bins.device).index_select(0, 2 * has_history + is_fast)
     return MotionMargin(bins, (speed >= MOVING) & (moving >= least))
-
-
-def _are_tall(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> Tensor:
-    """Tell which objects with a motion are higher than people and cars, (G,) bool."""
-    row, pixel = sweeps.points_of(objects.by_object.spread(rigid.flow.any(1)))
-    of_point = objects.by_object[pixel]
-    layer = sweeps.layer.index_select(0, row)
-    return of_point.max(layer, -HIGHEST_LAYER) - of_point.min(layer, HIGHEST_LAYER) >= _LAYERS
 
 
 def _margins(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigid: RigidMotion, is_fast: Tensor) -> Tensor:

@@ -89,9 +89,9 @@ def fit(sums: np.ndarray) -> dict[str, list[float]]:
         *2 * [(sizes, True)],
         *4 * [(shares, False)],
         *4 * [(1, False)],
-        *16 * [(margins, False)],
+        *8 * [(margins, False)],
     ]
-    first_moving = len(rows) - 16
+    first_moving = len(rows) - 8
     result: dict[str, list[float]] = {name: [] for name in TABLES}
     start = 0
     for number, (length, is_falling) in enumerate(rows):

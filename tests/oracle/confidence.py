@@ -20,7 +20,7 @@ TABLE: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
 DISPLACEMENT, BLOCK = 0.4, 1.6  # metres per interval; metres
 
 
-def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion, is_tall: bool) -> tuple[int, bool]:
+def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tuple[int, bool]:
     """The bin of an object with a motion, counted from the first one of such objects, and whether it moves.
 
     Members are all pixels of the node whose motion the object takes, also those that other objects took.
@@ -52,9 +52,8 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion, is_tal
         value = 0.0
     value /= math.sqrt(len(sweeps.elapsed) - 1)
     reached = (value >= np.array(TABLE["margin"])).sum()
-    row = 8 * sweeps.has_history + 4 * is_tall + 2 * is_far + is_fast
-    number = row * (1 + len(TABLE["margin"])) + reached
-    first = len(TABLE["moving"]) - 16 * (1 + len(TABLE["margin"]))
+    number = (4 * sweeps.has_history + 2 * is_far + is_fast) * (1 + len(TABLE["margin"])) + reached
+    first = len(TABLE["moving"]) - 8 * (1 + len(TABLE["margin"]))
     least = (0.04 if is_fast else 0.02) if sweeps.has_history else (0.15 if is_fast else 0.05)
     return int(number), bool(speed >= 0.05 and TABLE["moving"][first + number] >= least)
 
@@ -110,7 +109,7 @@ def probabilities(
     The bins of the table: left out; static in a pair and biased; static in an unmatched component, by its size; static,
     by the share of the slices in the block around that is found; static beside an object with a motion; of such an
     object, see `margin`. Each but the first two has rows, for pairs, then with history: one if unmatched, two if
-    static, not missing and missing, and eight of objects: low and tall, near and far, slow and fast. A block is 1.6 m
+    static, not missing and missing, and four of objects, near slow, near fast, far slow, far fast. A block is 1.6 m
     wide, and its slices are found if t+1 has them where they move to. A pixel is unmatched if t+1 lacks a slice around
     it. In pairs it is then missing. A component is unmatched if less than an eighth of its size is matched, the sum of
     the reach of its pixels of t. A missing pixel in one has a bin of that kind.

@@ -18,7 +18,7 @@ from oracle.candidates import propose
 from oracle.changed_pixels import find_changed
 from oracle.component_tree import Node, grow, select_objects
 from oracle.confidence import TABLE, margin, probabilities
-from oracle.height_slices import SLICE_HEIGHT, SlicedSweeps, Vector, ground_slope, is_residue, over_squares
+from oracle.height_slices import SlicedSweeps, Vector, ground_slope, is_residue, over_squares
 from oracle.paired_test import are_wide, count_wins, evidence_of
 from oracle.pixels import in_range
 from oracle.registration import register
@@ -28,7 +28,6 @@ from oracle.unlinked import link_unlinked
 
 CHANGED_Z = 2.0  # times as many standard deviations for nodes of changed pixels
 LEAVES = 20  # slices that a fast object must win for each one that it loses
-TALL = 5  # slices between the lowest and the highest point of tall objects
 
 
 def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, config: VerifiedConfig) -> PointMotion:
@@ -67,9 +66,7 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
     size, members = sweeps.size, [np.flatnonzero(object_of == i) for i in range(len(chosen))]
     rigid = register(sweeps, object_of, [(x * size, y * size) for y, x in motions])
     tested = [nodes[i].members if i >= 0 else own for i, own in zip(chosen, members)]  # all pixels of the node
-    layers = [np.floor(cloud.points[rows, 2] / SLICE_HEIGHT) for cloud, rows in zip(every, drawn)]
-    heights = [np.ptp(np.concatenate(layers)[object_of[sweeps.pixel_of_point] == i]) for i in range(len(chosen))]
-    margins = [margin(sweeps, *given) for given in zip(tested, rigid, np.array(heights) >= TALL)]
+    margins = [margin(sweeps, *given) for given in zip(tested, rigid)]
     bins = [number for number, _ in margins]
     of_pixels = probabilities(sweeps, object_of, rigid, bins, change[0], tree.levels[:-1][-2:])
 

@@ -11,6 +11,6 @@ from cflow_torch.verified import confidence
 @pytest.fixture
 def numbered(monkeypatch: pytest.MonkeyPatch) -> None:
     """The table with the number of each bin instead of its probability: no two bins are alike."""
-    places = [i / 256 for i in range(len(confidence.TABLE["probabilities"]))]
+    places = [i / 128 for i in range(len(confidence.TABLE["probabilities"]))]
     for module in (confidence, oracle):
         monkeypatch.setitem(module.TABLE, "probabilities", places)
