@@ -257,7 +257,7 @@ def _errors_of(drive):
 
 @pytest.mark.slow
 def test_what_moves_in_a_real_drive_is_told_from_bushes(kitti_file):
-    """Rows that fit simulated drives better may fit real ones worse: with rows of low and of tall objects, it is .89."""
+    """What fits simulated drives better may fit real ones worse: with rows of low and of tall objects, it is .89."""
     hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
     file = kitti_file.with_name("kitti-0000-c2.h5")
     if not file.exists():
