@@ -107,7 +107,7 @@ def recognise(root: Any) -> str:
                 break
             level = [path for folder in level for path in visible(folder)]
     found = [name for name in found if _has_logs(name, root)]  # nuScenes and TruckScenes have the same file names
-    if found and _has_clouds(marked[0], top):  # folders of other data sets may be called so
+    if found and any(_has_clouds(path, top) for path in marked):  # folders of other data sets may be called so
         opened = [name for name in found if _opens(name, root)]
         found = ["arrays"] if not opened and _opens("arrays", root) else opened or found
     if not found and _has_logs("arrays", root):

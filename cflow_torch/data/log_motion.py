@@ -14,6 +14,7 @@ from cflow_torch.diagnosis.inspection import repeats
 from cflow_torch.diagnosis.readings import (
     GIVEN,
     LEAST_SHARE,
+    UNKNOWN,
     Judgement,
     Pair,
     difference,
@@ -27,6 +28,7 @@ _CHANGES = (-4, -1, 1, 4)  # sweeps between a pair and those whose motion should
 _REACH = 10  # sweeps before and after a pair, whose poses may be those of the pair
 # Metres a sweep, of points 20 m away. If it is less, a wrong direction moves static objects by millimetres only.
 _LEAST_SPEED, _LEAST_TIMED = 0.5, 0.1
+_UNCLEAR = 0.2  # share in place, below which poses that hardly move are compared with the motion of the sensor
 _LEAST_MOTION = 0.2  # metres between the sweeps of a pair, else the vehicle stands
 # A step between two poses is suspect if it differs from its neighbours' by this, as a length or as a part of theirs.
 _SUSPECT, _SUSPECT_SHARE = 0.2, 0.3
@@ -147,9 +149,21 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
         others = _pairs_without_repeats(log, poses, jumps, {index for pair in pairs for index in pair})
         again = judge(make_pairs(others, scans, False)) if judgement.best and others else judgement
         judgement = again if _contradicts(again, judgement) else judgement
+    is_unclear = not judgement.best and judgement.given < _UNCLEAR
+    if poses is not None and is_unclear and _hardly_move(poses):
+        spread = choose_pairs(len(log.timestamps), None)
+        clouds = [[replace(log.sweep(index), pose=None) for index in pair] for pair in spread]
+        unposed = judge(make_pair(pc0, pc1) for pc0, pc1 in clouds)
+        judgement = unposed if UNKNOWN in unposed.best else judgement
     if STILL in judgement.best and log.unwrapped.has_viewpoints:
         return replace(judgement, shares={**judgement.shares, WORLD: judgement.shares[STILL]}, best=(WORLD,))
     return judgement
+
+
+def _hardly_move(poses: np.ndarray) -> bool:
+    """Test whether points 20 m away move by less than 0.1 m in most sweep intervals."""
+    first = np.arange(len(poses) - 1)
+    return bool(np.median(difference(_motions(poses, first, first + 1), np.eye(4))) < _LEAST_TIMED)
 
 
 def fits_better(log: Log, others: np.ndarray) -> bool:

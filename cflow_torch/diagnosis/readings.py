@@ -62,6 +62,7 @@ EQUAL = 0.95  # readings whose share is at least this part of the best one are n
 _FAR, _OF_FAR, _AS_LONG = 2.0, 1 / 3, 0.99
 _OF_ERRORS = 1.2  # least share with another motion in each pair over that as given
 _EXCUSE = 1.1  # share with another motion in each pair over that of a reading with a name
+_LEVEL = np.radians(5)  # tilt up to which only the angle about z is told
 _SLIGHT, _OBLIQUE = np.radians((2, 10))  # least angles between axes that are turned and those as given, or with a name
 _RESCALED = 1.05  # least factor between motions of another scale
 _OF_UNIT = 1.5  # largest factor between a scale, which is not exact, and that of a unit, which the points then confirm
@@ -409,14 +410,17 @@ def _mounting(rotation: np.ndarray, place: np.ndarray) -> Reading:
     causes = []
     fixes = []
     where = "data.ego_T_lidar with"
-    if turn_of(rotation) > 0 and rotation[2, 2] > np.cos(_OBLIQUE):
+    if turn_of(rotation) > 0 and rotation[2, 2] > np.cos(_LEVEL):
         degrees = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
         side = "left" if degrees > 0 else "right"
         causes.append(f"the points' x axis points about {abs(degrees):.0f} degrees to the {side} of the poses'")
         fixes.append(f"a rotation of about {degrees:.0f} degrees about z")
     elif turn_of(rotation) > 0:
         names = [_DIRECTIONS[axis][int(row[axis] < 0)] for row in rotation for axis in [int(np.abs(row).argmax())]]
-        causes.append(f"the poses are of another sensor, whose x, y and z axes point {', '.join(names)}")
+        if names == [same for same, _ in _DIRECTIONS]:
+            causes.append(f"the points are turned by about {np.degrees(turn_of(rotation)):.0f} degrees")
+        else:
+            causes.append(f"the poses are of another sensor, whose x, y and z axes point {', '.join(names)}")
         fixes.append(f"a rotation of about {(np.round(rotation, 3) + 0.0).tolist()}")
         where = "data.ego_T_lidar, the transform from the LiDAR to it (in data=arrays with data.poses_of=sensor), with"
     if place.any():

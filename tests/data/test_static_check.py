@@ -217,6 +217,13 @@ def test_wrong_poses_are_named_and_the_reading_undoes_them(reading, source, requ
     assert np.allclose(true, read, atol=0.01 if is_half else 1e-6), "the motion between the sweeps is the true one"
 
 
+def test_a_small_tilt_is_told_as_a_turn_of_that_size(drive):
+    """As 0 degrees about z, it would be no help."""
+    wrong = Wrong(drive, poses=each(lambda pose: pose @ as_matrix(rotations_about(1, np.radians(9.5)))))
+    texts = find_problems(wrong)
+    assert not any("points about 0 degrees" in text for text in texts)
+
+
 @pytest.mark.parametrize("name", ["mirrored", "swapped", "swapped_back"])
 def test_mirrored_clouds_are_named_and_no_pose_is_blamed(drive, name):
     axes = AXES[name]  # its own inverse
@@ -520,6 +527,20 @@ def test_two_mistakes_are_named_with_one_setting(drive):
         assert find_problems(read_as(wrong, setting.split(","))) == []
 
 
+@pytest.mark.parametrize("is_frozen_again", [False, True])
+def test_poses_that_are_frozen_in_most_sweeps_are_named(drive, is_frozen_again):
+    """The few pairs that move show little."""
+
+    def frozen(poses):
+        poses = poses.copy()
+        poses[:8] = poses[0]
+        if is_frozen_again:
+            poses[8:] = as_matrix(np.eye(3), (1, 0, 0)) @ poses[0]
+        return poses
+
+    assert any("hardly move" in text for text in find_problems(Wrong(drive, poses=frozen)))
+
+
 @pytest.mark.parametrize("source", ["drive", "real"])
 def test_missing_poses_are_named_if_the_sensor_moves(source, request):
     good = request.getfixturevalue(source)
@@ -767,10 +788,12 @@ def test_poses_of_the_lidar_are_told_from_those_of_the_vehicle(drive, tmp_path):
         write_array_log(Wrong(level, poses=lambda _, poses=poses: poses, masks=False, name=name), tmp_path)
         log = ArraysLog(tmp_path / name, ego_T_lidar=tilt)
         assert np.allclose(log.poses, drive.poses, atol=1e-6)
-        assert any("poses are those of the LiDAR" in note for note in log.notes) == (name == "lidar")
+        assert any("poses fit those of the LiDAR" in note for note in log.notes) == (name == "lidar")
     sensor = ArraysLog(tmp_path / "ego", ego_T_lidar=tilt, poses_of="sensor")
     assert np.allclose(sensor.poses, drive.poses @ tilt, atol=1e-6)
-    assert np.allclose(sensor.sweep(3).points, level.sweep(3).points, atol=1e-4), "the points stay"
+    bare = ArraysLog(tmp_path / "ego", poses=None, ego_T_lidar=tilt, poses_of="sensor")
+    for log in (sensor, bare):
+        assert np.allclose(log.sweep(3).points, level.sweep(3).points, atol=1e-4), "the points stay"
 
 
 CAMERA_AHEAD = as_matrix(rotations_about(1, np.radians(8)) @ AXES[CAMERA], (1.2, 0.3, 0.4))
@@ -778,19 +801,19 @@ INERTIAL_UNIT = as_matrix(rotations_about(2, np.radians(15)) @ rotations_about(1
 
 
 @pytest.mark.parametrize(
-    ("lidar_T_sensor", "axes"),
+    ("lidar_T_sensor", "cause"),
     [
-        (as_matrix(AXES["z_first"].T), "left, up, ahead"),  # as of LOAM
-        (CAMERA_AHEAD, "right, down, ahead"),
-        (INERTIAL_UNIT, "ahead, left, up"),
+        (as_matrix(AXES["z_first"].T), "another sensor, whose x, y and z axes point left, up, ahead"),  # as of LOAM
+        (CAMERA_AHEAD, "another sensor, whose x, y and z axes point right, down, ahead"),
+        (INERTIAL_UNIT, "the points are turned by about 3"),  # 33 degrees
     ],
     ids=["loam", "camera", "imu"],
 )
-def test_poses_of_another_sensor_are_named_with_its_axes_and_place(turning, lidar_T_sensor, axes):
+def test_poses_of_another_sensor_are_named_with_its_axes_and_place(turning, lidar_T_sensor, cause):
     """The points are right: nothing may be said of them."""
     wrong = Wrong(turning, poses=each(lambda pose: pose @ lidar_T_sensor))
     (problem,) = [text for text in find_problems(wrong) if "ground masks" not in text]
-    assert f"another sensor, whose x, y and z axes point {axes}" in problem and "data.read_as" not in problem
+    assert cause in problem and "data.read_as" not in problem
     rotation = np.array(json.loads(re.search(r"rotation of about (\[\[.*?\]\])", problem)[1]))
     assert np.degrees(turn_of(rotation @ lidar_T_sensor[:3, :3])) < 5
     if lidar_T_sensor is CAMERA_AHEAD:

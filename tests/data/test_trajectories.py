@@ -993,17 +993,20 @@ def test_an_empty_first_cloud_and_a_folder_called_as_a_record_hide_no_log(tmp_pa
     assert find_array_logs(tmp_path) == [tmp_path / "drive"]
 
 
-@pytest.mark.parametrize("order", ["tq", "qt", "tq_w_first"])
-def test_poses_of_seven_numbers_in_json_are_read(tmp_path, order) -> None:
-    quaternion = to_quaternions(POSES[:, :3, :3])  # w first
-    quaternion = quaternion if order == "tq_w_first" else np.roll(quaternion, -1, 1)
-    parts = [quaternion, POSES[:, :3, 3]]
-    numbers = np.concatenate(parts if order == "qt" else parts[::-1], axis=1).tolist()
+@pytest.mark.parametrize("is_from_origin", [False, True])
+@pytest.mark.parametrize("order", ["tq", "qt", "tq_w_first", "qt_w_first"])
+def test_poses_of_seven_numbers_in_json_are_read(tmp_path, order, is_from_origin) -> None:
+    """From the origin, the first pose is 0, 0, 0, 1, 0, 0, 0: both ends look like a quaternion."""
+    poses = np.linalg.inv(POSES[0]) @ POSES if is_from_origin else POSES
+    quaternion = to_quaternions(poses[:, :3, :3])  # w first
+    quaternion = quaternion if order.endswith("w_first") else np.roll(quaternion, -1, 1)
+    parts = [quaternion, poses[:, :3, 3]]
+    numbers = np.concatenate(parts if order.startswith("qt") else parts[::-1], axis=1).tolist()
     frames = [{"frame_id": f"sweep {k}", "pose": pose} for k, pose in enumerate(numbers)]
     (tmp_path / "poses.json").write_text(
         json.dumps({"calib": dict.fromkeys("ab", {"T": np.eye(4).tolist()}), "frames": frames})
     )
-    assert np.allclose(poses_text.read_poses(tmp_path / "poses.json").poses, POSES)
+    assert np.allclose(poses_text.read_poses(tmp_path / "poses.json").poses, poses)
 
 
 def test_quaternions_of_one_length_are_normalised(tmp_path) -> None:

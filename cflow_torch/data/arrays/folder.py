@@ -275,7 +275,7 @@ def find_poses(
         a log is returned if nothing fits, because it should.
     """
     folders = dict.fromkeys([folder, *(path.parent for path in clouds[:1])])
-    own = [path for each in folders for path in find_pose_files(each, clouds)]
+    own = [path for each in folders for path in find_pose_files(each, frozenset(clouds))]
     top = folder.resolve()
     kitti = top.parent.parent / "poses" / f"{top.name}.txt"
     called = [path for path in own if path.name in POSE_FILES]

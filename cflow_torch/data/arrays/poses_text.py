@@ -31,6 +31,7 @@ _POSITION, _ANGLES = ("x", "y", "z"), ("roll", "pitch", "yaw")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _ROTATIONS = {*MATRIX[0:3], *MATRIX[4:7], *MATRIX[8:11], *_QUATERNION, "q0", "q1", "q2", "q3"}  # not all are zero
 _TIMES = {"time", "sec", "nsec"}
+_LEAST_W = 0.02  # mean of w, if it is the first of four numbers without names
 _TUM = ("time", *_POSITION, "qx", "qy", "qz", "qw")
 _UNNAMED = {
     7: _TUM[1:],
@@ -226,8 +227,10 @@ def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.
         values["x"], values["y"] = positions_of_degrees(values["latitude"], values["longitude"])
     positions = np.stack([values.get(axis, zeros) for axis in _POSITION], axis=1)
     if "q0" in values and not set(_QUATERNION) <= set(values):
-        q0, _, q2, _ = (np.abs(values[f"q{k}"]).sum() for k in range(4))
-        values.update(zip(_QUATERNION if q2 < q0 else _TUM[4:], (values[f"q{k}"] for k in range(4))))
+        # A vehicle hardly rolls or pitches: if w comes first, the two in the middle are small, else the first two, and
+        # also the third while its heading is that of the start.
+        q0, q2 = (np.abs(values[name]).mean() for name in ("q0", "q2"))
+        values.update(zip(_QUATERNION if q0 > max(q2, _LEAST_W) else _TUM[4:], (values[f"q{k}"] for k in range(4))))
     if set(_QUATERNION) <= set(values):
         quaternions = np.stack([values[name] for name in _QUATERNION], axis=1)
         length: np.ndarray = np.linalg.norm(quaternions, axis=1)

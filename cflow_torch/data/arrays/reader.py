@@ -53,8 +53,9 @@ class ArraysLog(Log):
             folder there whose contents are poses, or VIEWPOINT of `.pcd` files if it is set, or those in arrays of
             each `.npz` file, or the only file of text in a folder near this one that has poses at the unix times of the
             sweeps; None = no poses; or a file (see `read_poses`); or a (K, 4, 4) array.
-        poses_of: whose poses these are: "ego", "lidar", or "sensor" = of another sensor: `ego_T_lidar` then maps to it,
-            and the points stay. "auto" = of the LiDAR if the static world then stands still clearly better, else "ego".
+        poses_of: whose poses these are: "ego", "lidar", or "sensor" = of another sensor. Then `ego_T_lidar` maps to
+            this sensor, the ego frame is the LiDAR's, and the points stay. "auto" = of the LiDAR if the static world
+            then stands still clearly better, else "ego".
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
         times: "auto" = times.txt in the folder, or see `timestamps`; None = none; or a file with one time per sweep.
@@ -78,7 +79,8 @@ class ArraysLog(Log):
 
     Convention:
         `missing_returns` stay, as NaN, so that results have a row for every row of the file. Sweeps are in the ego
-        frame, which should have z up: points are transformed by `ego_T_lidar` in float64, then rounded to float32.
+        frame, which should have z up. Unless `poses_of` is "sensor", points are transformed by `ego_T_lidar` in
+        float64, then rounded to float32.
     """
 
     has_raw_times: bool = True
@@ -110,13 +112,14 @@ class ArraysLog(Log):
         if others:
             self._note(f"we read the clouds in {self.files[0].parent.name}; there are others in {', '.join(others)}")
         self._ground = resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
-        self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
-        self.lidar_position = np.zeros(3) if poses_of == "sensor" else self.ego_T_lidar[:3, 3]
+        mounting = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         stated, file_of_times = self._stated_times(times), None
         stamps = stated
         if stated is None and times == "auto":
             stamps, file_of_times = self._tabled_times()
-        trajectory, poses_of = self._trajectory(poses, poses_of, calibration, stamps)
+        trajectory, whose = self._trajectory(poses, poses_of, calibration, stamps)
+        self.ego_T_lidar = np.eye(4) if whose == "sensor" else mounting
+        self.lidar_position = self.ego_T_lidar[:3, 3]
         counted = None if trajectory is None else trajectory.counted(stated).times_ns
         if stated is None and counted is not None and len(counted) == len(self.files):
             stamps = counted.tolist()
@@ -124,8 +127,8 @@ class ArraysLog(Log):
             self._note(f"the times of its sweeps are those of {file_of_times.name}")
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
-        self.poses = None if trajectory is None else self._pose_per_sweep(self._of_ego(trajectory, poses_of), stamps)
-        if poses_of == "auto" and ego_T_lidar is not None and self.poses is not None:
+        self.poses = None if trajectory is None else self._pose_per_sweep(_of_ego(trajectory, whose, mounting), stamps)
+        if whose == "auto" and ego_T_lidar is not None and self.poses is not None:
             self._ask_whose_poses()
         self.gaps |= frozenset(self._gaps_in_numbers())
         self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAYS))
@@ -210,15 +213,6 @@ class ArraysLog(Log):
             return trajectory, "lidar"
         return trajectory._replace(poses=converted), "lidar"
 
-    def _of_ego(self, trajectory: Trajectory, poses_of: str) -> Trajectory:
-        """Return the poses of the ego frame. If poses are of another sensor, it is the LiDAR's."""
-        if poses_of == "lidar":
-            return trajectory.seen_from(np.linalg.inv(self.ego_T_lidar))
-        if poses_of == "sensor":
-            trajectory = trajectory.seen_from(self.ego_T_lidar)
-            self.ego_T_lidar = np.eye(4)
-        return trajectory
-
     def _ask_whose_poses(self) -> None:
         """Take the poses for those of the LiDAR if the static world then stands still clearly better."""
         lidar_T_ego = np.linalg.inv(self.ego_T_lidar)
@@ -228,7 +222,9 @@ class ArraysLog(Log):
         except (CFlowError, OSError):  # `sweep` raises the error of the sweep that cannot be read
             return
         if are_of_lidar:
-            self._note("its poses are those of the LiDAR. data.poses_of=lidar does the same without this line")
+            self._note(
+                "its poses fit those of the LiDAR, so we take them for these; set data.poses_of=lidar to confirm it"
+            )
             self.poses = others
             self.trajectory = self.trajectory and (self.trajectory[0], self.trajectory[1] @ lidar_T_ego)
 
@@ -360,6 +356,13 @@ class ArraysLog(Log):
         missing = f"sweeps are missing by the numbers of its files, first after {first}"
         self._note(f"{missing}; no history or future of a window reaches over them")
         return gaps  # type: ignore[no-any-return]
+
+
+def _of_ego(trajectory: Trajectory, whose: str, mounting: np.ndarray) -> Trajectory:
+    """Return the poses of the ego frame, from those of the LiDAR or of a sensor to which `mounting` maps points."""
+    if whose == "lidar":
+        return trajectory.seen_from(np.linalg.inv(mounting))
+    return trajectory.seen_from(mounting) if whose == "sensor" else trajectory
 
 
 def _are_regular(numbers: Sequence[int]) -> bool:

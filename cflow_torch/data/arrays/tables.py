@@ -139,7 +139,8 @@ def table_of(members: Sequence[Any], labels: Sequence[str] = ()) -> Table | None
         return None
     texts = list(labels) or [_text_of(member) for member in members]
     words = [[row.get(name, "nan") for name in names] for row in rows]
-    return Table(list(names), np.array(words, str), texts if len({*texts, ""}) > len(texts) else [])
+    table = np.array(words, str)
+    return Table(_name_sevens(list(names), table), table, texts if len({*texts, ""}) > len(texts) else [])
 
 
 def _value_of(content: bytes, path: Path) -> Any:
@@ -201,10 +202,6 @@ def _numbers_of(value: Any, name: str) -> Iterator[tuple[str, str]]:
     if isinstance(value, Decimal):
         yield name, str(value)
     elif numbers:
-        starts = [k for k in (3, 0) if len(numbers) == 7 and _is_unit(numbers[k : k + 4])]
-        if starts:
-            yield from zip((*_PLACE, *_FOUR) if starts[0] else (*_FOUR, *_PLACE), map(str, numbers))
-            return
         kind = len(numbers), role_of_name(f"{name}.x")
         ends = MATRIX if len(numbers) in (12, 16) else _VECTORS.get(kind, range(len(numbers)))
         yield from ((f"{name}.{end}".lstrip("."), str(number)) for end, number in zip(ends, numbers))
@@ -213,8 +210,25 @@ def _numbers_of(value: Any, name: str) -> Iterator[tuple[str, str]]:
             yield from _numbers_of(member, f"{name}.{key}" if name else key)
 
 
-def _is_unit(numbers: Sequence[Decimal]) -> bool:
-    return bool(abs(np.linalg.norm(np.array(numbers, np.float64)) - 1) < ROUNDING)
+def _name_sevens(names: list[str], words: np.ndarray) -> list[str]:
+    """Return the names of columns, and name those of lists of seven numbers: a position and a quaternion, or reversed.
+
+    The quaternion has length 1 in all rows. If both ends have, it is the one that varies less.
+    """
+    named = list(names)
+    for name in [name for name in names if name == "0" or name.endswith(".0")]:
+        columns = [names.index(f"{name[:-1]}{k}") for k in range(7) if f"{name[:-1]}{k}" in names]
+        if len(columns) != 7 or f"{name[:-1]}7" in names:
+            continue
+        values = words[:, columns].astype(np.float64)
+        values = values[np.isfinite(values).all(axis=1)]
+        fours = {start: values[:, start : start + 4] for start in (3, 0)}
+        units = [k for k, four in fours.items() if (np.abs(np.linalg.norm(four, axis=1) - 1) < ROUNDING).all()]
+        if len(values) and units:
+            start = min(units, key=lambda k: float(fours[k].std(axis=0).sum()))
+            for column, found in zip(columns, (*_PLACE, *_FOUR) if start else (*_FOUR, *_PLACE)):
+                named[column] = found
+    return named
 
 
 def _text_of(value: Any) -> str:
