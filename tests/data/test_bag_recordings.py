@@ -54,11 +54,23 @@ class Recorder:
             pose = make("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36))
             self.writer.write("/odom", stamp, ODOMETRY, self.writer.header(stamp, parent), child, pose, twist)
 
-    def clouds(self, sweeps: Any = None, stamp: Callable[[int], int] = int) -> None:
+    def clouds(self, sweeps: Any = None, stamp: Callable[[int], int] = int, lag: int = 0) -> None:
+        """Clouds that arrive `lag` nanoseconds after the times of their sweeps."""
         for k in range(8) if sweeps is None else sweeps:
             unit = self.recording.units(k)[0]
             fields = self.writer.cloud(stamp(self.stamps[k]), unit.points, None)
-            self.writer.write("/points", self.stamps[k], CLOUD, *fields)
+            self.writer.write("/points", self.stamps[k] + lag, CLOUD, *fields)
+
+    def registered(self, *frames: str) -> None:
+        """Clouds in the frame of the world, and the transforms of frames that drive in it, one after another."""
+        for k, stamp in enumerate(self.stamps):
+            for n, frame in enumerate(frames):
+                self.transform(stamp, "camera_init", frame, self.recording.pose_at(stamp - n * STEP))
+            T = self.recording.pose_at(stamp)
+            points = self.recording.units(k)[0].points @ T[:3, :3].T + T[:3, 3]
+            header, *fields = self.writer.cloud(stamp, points.astype(np.float32), None)
+            header.frame_id = "camera_init"
+            self.writer.write("/registered", stamp, CLOUD, header, *fields)
 
     def close(self) -> Path:
         self.writer.bag.close()
@@ -314,21 +326,37 @@ def test_a_gap_splits_windows(tmp_path) -> None:
         assert open_log("bags", bag.close()).gaps == {2}
 
 
-@pytest.mark.parametrize("has_odometry", [True, False])
-def test_clouds_in_the_frame_of_the_world_are_moved_to_the_vehicle(tmp_path, has_odometry: bool) -> None:
+@pytest.mark.parametrize(("has_odometry", "frames"), [(True, ["body"]), (False, ["body"]), (True, ["body", "camera"])])
+def test_clouds_in_the_frame_of_the_world_are_moved_to_the_vehicle(tmp_path, has_odometry: bool, frames: Any) -> None:
     bag = Recorder(tmp_path)
     if has_odometry:
         bag.odometry("body", "camera_init")
-    for k, stamp in enumerate(bag.stamps):
-        bag.transform(stamp, "camera_init", "body", bag.recording.pose_at(stamp))
-        T = bag.recording.pose_at(stamp)
-        points = bag.recording.units(k)[0].points @ T[:3, :3].T + T[:3, 3]
-        header, *fields = bag.writer.cloud(stamp, points.astype(np.float32), None)
-        header.frame_id = "camera_init"
-        bag.writer.write("/registered", stamp, CLOUD, header, *fields)
+    bag.registered(*frames)
     with pytest.warns(CFlowWarning, match="clouds are in camera_init, the frame of the world; we move them to body"):
         log = BagLog(bag.close())
     assert np.allclose(log.sweep(3).points, bag.recording.units(3)[0].points, atol=5e-3)
+    assert np.allclose(log.poses[3], bag.recording.pose_at(bag.stamps[3]))
+
+
+def test_of_two_frames_that_drive_in_the_frame_of_the_clouds_one_must_be_chosen(tmp_path) -> None:
+    bag = Recorder(tmp_path)
+    bag.registered("body", "camera")
+    path = bag.close()
+    with pytest.warns(CFlowWarning, match=r"body, camera move in camera_init, .*frame \(data.frame\)"):
+        assert BagLog(path).poses is None
+    log = BagLog(path, frame="body")
+    assert np.allclose(log.sweep(3).points, bag.recording.units(3)[0].points, atol=5e-3)
+
+
+def test_the_frame_of_a_lidar_that_carries_base_link_is_not_that_of_the_world(tmp_path, recwarn) -> None:
+    bag = Recorder(tmp_path)
+    bag.transform(bag.stamps[0], "velodyne", "base_link", np.linalg.inv(MOUNT))
+    for stamp in range(bag.stamps[0] - 10**8, bag.stamps[-1] + 10**8, STEP):
+        bag.transform(stamp, "odom", "velodyne", bag.recording.pose_at(stamp) @ MOUNT)
+    bag.clouds()
+    log = BagLog(bag.close())
+    assert log.frame == "base_link" and world(log, bag.recording) < 5e-3
+    assert not [each for each in recwarn if "frame of the world" in str(each.message)]
 
 
 LIVOX = {

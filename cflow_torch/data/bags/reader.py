@@ -261,18 +261,17 @@ class BagLog(Log):
     def _ego_frame(self) -> str:
         """Return the frame of the vehicle. Without transforms to the LiDAR, it is the LiDAR's own."""
         frames, lidar = self._frames, self._lidar
-        vehicle = frames.vehicle_of(lidar)
+        driven = [child for child in self._child.values() if frames.drives_in(child, lidar)]
+        vehicle = frames.vehicle_of(lidar) or next(iter(driven), "")
         if vehicle:
-            if lidar in frames.chain(vehicle)[1:]:  # an odometry that publishes registered clouds
+            if frames.drives_in(vehicle, lidar):  # an odometry that publishes registered clouds
                 self._note(f"its clouds are in {lidar}, the frame of the world; we move them to {vehicle}")
             return vehicle
         for name in filter(None, (BASE, *self._child.values())):
             is_in_tf = len(frames.change_times(name)) > 1
-            if (
-                self._mount is None
-                and not frames.are_joined(name, lidar)
-                and (is_in_tf or name in self._child.values())
-            ):
+            if frames.are_joined(name, lidar):
+                continue
+            if self._mount is None and (is_in_tf or name in self._child.values()):
                 self._note(
                     f"no transform connects its LiDAR ({lidar}) to {name}, whose poses it has. We assume that both are "
                     "in one place; pass the mounting of the LiDAR, ego_T_lidar (data.ego_T_lidar)",
@@ -281,6 +280,13 @@ class BagLog(Log):
             if is_in_tf:
                 self._mount = np.eye(4) if self._mount is None else self._mount
                 return name
+        moving = frames.moving_in(lidar)
+        if moving:
+            names = shortened(", ".join(moving))
+            self._note(
+                f"{names} move in {lidar}, the frame of its clouds. If one is the vehicle, choose it by frame "
+                "(data.frame)"
+            )
         return lidar
 
     def _scan(self) -> tuple[dict[int, tuple[int, int]], dict[str, list[Any]]]:
