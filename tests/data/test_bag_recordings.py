@@ -258,6 +258,18 @@ def test_repeated_stamps_are_named(tmp_path) -> None:
         assert world(BagLog(loop.close()), loop.recording) < 5e-3
 
 
+@pytest.mark.parametrize("unit", [1000, 1_000_000])
+def test_stamps_of_a_smaller_unit_are_replaced(tmp_path, unit: int) -> None:
+    """Microseconds and milliseconds that are written as nanoseconds; every other step is a little longer."""
+    bag = Recorder(tmp_path)
+    bag.mount()
+    bag.drive()
+    bag.clouds(stamp=lambda stamp: (stamp + bag.stamps.index(stamp) % 2 * 10**6) // unit)
+    with pytest.warns(CFlowWarning, match="so we use their times of arrival"):
+        log = BagLog(bag.close())
+    assert [time - 40_000_000 for time in log.timestamps] == list(bag.stamps)
+
+
 def test_corrections_of_a_map_do_not_move_the_ego(tmp_path) -> None:
     bag = Recorder(tmp_path)
     bag.mount()

@@ -51,7 +51,8 @@ _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by less
 _LARGEST_DELAY = 500_000_000  # nanoseconds by which messages arrive later than others
 _EARLY = 100_000_000  # nanoseconds; a message that arrives so long before its time has another clock than the recorder
-_SLOWEST, _AROUND = 1000, 3  # times by which arrivals grow more than stamps; clouds around a fall of the stamps
+_SLOWEST = 100  # the factor by which arrivals grow faster than stamps, at least
+_AROUND = 3  # clouds before, and after, a fall of the stamps
 _NEED = "bags need rosbags (extra bags): pip install rosbags"
 _LOST = "{} that are NaN or zeros are left out"
 
