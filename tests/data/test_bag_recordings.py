@@ -313,12 +313,13 @@ def test_a_bad_transform_of_another_frame_stops_no_bag(tmp_path) -> None:
     assert world(BagLog(bag.close()), bag.recording) < 5e-3
 
 
-def test_a_clock_that_is_set_back_runs_on(tmp_path) -> None:
-    """The driver's clock, by NTP or PTP, in the middle of a recording, and one message that arrives late."""
+@pytest.mark.parametrize("sweep", range(1, 8))
+def test_a_clock_that_is_set_back_runs_on(tmp_path, sweep: int) -> None:
+    """The driver's clock, by NTP or PTP, anywhere in a recording, and one message that arrives late."""
     bag = Recorder(tmp_path / "back")
     bag.mount()
     bag.drive()
-    bag.clouds(stamp=lambda stamp: stamp - 330_000_000 * (stamp >= bag.stamps[4]))
+    bag.clouds(stamp=lambda stamp: stamp - 330_000_000 * (stamp >= bag.stamps[sweep]))
     with pytest.warns(CFlowWarning, match=r"the clock of its clouds was set back by 0\.33 s"):
         log = BagLog(bag.close())
     assert list(log.timestamps) == list(bag.stamps) and world(log, bag.recording) < 5e-3

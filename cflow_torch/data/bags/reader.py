@@ -52,7 +52,7 @@ _ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by 
 _LARGEST_DELAY = 500_000_000  # nanoseconds by which messages arrive later than others
 _EARLY = 100_000_000  # nanoseconds; a message that arrives so long before its time has another clock than the recorder
 _SLOWEST = 100  # the factor by which arrivals grow faster than stamps, at least
-_AROUND = 3  # clouds before, and after, a fall of the stamps
+_AROUND = 3  # clouds before, and after, a fall of the stamps, at most
 _NEED = "bags need rosbags (extra bags): pip install rosbags"
 _LOST = "{} that are NaN or zeros are left out"
 
@@ -364,8 +364,8 @@ class BagLog(Log):
             self._note(f"{count} clouds repeat the time stamp of an earlier one and are left out; was it played twice?")
         delay = [arrived - stamp for stamp, arrived in first]
         shift = np.zeros(len(first), np.int64)
-        for k in range(_AROUND, len(first) - _AROUND + 1):
-            before, after = sorted(delay[k - _AROUND : k]), sorted(delay[k : k + _AROUND])
+        for k in range(1, len(first)):
+            before, after = sorted(delay[max(k - _AROUND, 0) : k]), sorted(delay[k : k + _AROUND])
             jump, spread = after[0] - before[-1], max(after[-1] - after[0], before[-1] - before[0])
             if first[k][0] < first[k - 1][0] and jump > spread:  # else messages arrived late
                 back = _middle(after) - _middle(before)
