@@ -258,6 +258,17 @@ def test_repeated_stamps_are_named(tmp_path) -> None:
         assert world(BagLog(loop.close()), loop.recording) < 5e-3
 
 
+def test_a_loop_that_stops_midway_keeps_its_order(tmp_path, recwarn) -> None:
+    """The clock of the clouds is 10 % fast, so they arrive ever earlier by their stamps."""
+    loop = Recorder(tmp_path)
+    start = loop.stamps[0]
+    for sweeps, lag in ((range(8), 0), (range(4), 8 * 10**8)):
+        loop.clouds(sweeps, stamp=lambda stamp: stamp + (stamp - start) // 10, lag=lag)
+    log = BagLog(loop.close())
+    assert list(log.timestamps) == [start + k * 110_000_000 for k in range(8)]
+    assert not [each for each in recwarn if "set back" in str(each.message)]
+
+
 @pytest.mark.parametrize("unit", [1000, 1_000_000])
 def test_stamps_of_a_smaller_unit_are_replaced(tmp_path, unit: int) -> None:
     """Microseconds and milliseconds that are written as nanoseconds; every other step is a little longer."""

@@ -358,7 +358,10 @@ class BagLog(Log):
             count = len(stamps) - sum(is_same)
             self._note(f"its {len(stamps)} clouds have {count} different time stamps, so we use their times of arrival")
             return {arrived: (arrived, arrived - stamp) for stamp, arrived in stamps}
-        first = list(dict(reversed(stamps)).items())[::-1]  # clouds that are played twice repeat their stamps
+        arrival: dict[int, int] = {}
+        for stamp, arrived in stamps:
+            arrival.setdefault(stamp, arrived)  # clouds that are played twice repeat their stamps
+        first = list(arrival.items())
         if len(first) < len(stamps):
             count = len(stamps) - len(first)
             self._note(f"{count} clouds repeat the time stamp of an earlier one and are left out; was it played twice?")
