@@ -80,14 +80,16 @@ class BagLog(Log):
             first available of: transforms in which the ego frame moves, the only topic of these types, the only file in
             a folder near the bag that has poses at the times of the clouds, none.
         frame: name of the ego frame; None = the vehicle that carries the LiDAR or drives in the frame of the clouds,
-            see `Frames.vehicle_of`, else the LiDAR's own.
+            see `Frames.vehicle_of`, else the child of a topic that drives in it, else the LiDAR's own.
         ego_T_lidar: (4, 4), maps the frame of the clouds to the ego frame; None = from the transforms.
 
     Attributes:
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
         trajectory: times and `T_world_ego` of all transforms or messages, by which `DeskewedLog` moves points.
-        timestamps: nanoseconds from the header of each cloud, unless arrivals contradict them, see `_timed`. Clouds
-            before the first or after the last pose are left out.
+        timestamps: nanoseconds from the header of each cloud. If headers hardly change from one cloud to the next, they
+            are the times of arrival. If a clock was set back, it runs on. If the clocks of clouds and poses surely
+            differ, they are shifted to that of the poses. Each of these is said. Clouds before the first or after the
+            last pose are left out.
         topic, frame: the settings in use.
 
     Convention: points are in the ego frame, as measured (`open_log` de-skews them). Poses are interpolated at the time
@@ -347,8 +349,8 @@ class BagLog(Log):
     def _timed(self, stamps: list[tuple[int, int]]) -> dict[int, tuple[int, int]]:
         """Return the arrival of each cloud by its time, and by how much the time differs from the stamp.
 
-        Stamps that hardly grow from one arrival to the next are replaced by the arrivals. If they fall, a clock was set
-        back, and we let it run on. We say both.
+        Stamps that hardly grow from one arrival to the next are replaced by the arrivals. If they fall, and the delays
+        grow at once, a clock was set back, and we let it run on. A note says what was done.
 
         Args:
             stamps: of each cloud, that of its header and its arrival, in the order of arrival.
