@@ -54,11 +54,23 @@ class Recorder:
             pose = make("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36))
             self.writer.write("/odom", stamp, ODOMETRY, self.writer.header(stamp, parent), child, pose, twist)
 
-    def clouds(self, sweeps: Any = None, stamp: Callable[[int], int] = int) -> None:
+    def clouds(self, sweeps: Any = None, stamp: Callable[[int], int] = int, lag: int = 0) -> None:
+        """Clouds that arrive `lag` nanoseconds after the times of their sweeps."""
         for k in range(8) if sweeps is None else sweeps:
             unit = self.recording.units(k)[0]
             fields = self.writer.cloud(stamp(self.stamps[k]), unit.points, None)
-            self.writer.write("/points", self.stamps[k], CLOUD, *fields)
+            self.writer.write("/points", self.stamps[k] + lag, CLOUD, *fields)
+
+    def registered(self, *frames: str) -> None:
+        """Clouds in the frame of the world, and the transforms of frames that drive in it, one after another."""
+        for k, stamp in enumerate(self.stamps):
+            for n, frame in enumerate(frames):
+                self.transform(stamp, "camera_init", frame, self.recording.pose_at(stamp - n * STEP))
+            T = self.recording.pose_at(stamp)
+            points = self.recording.units(k)[0].points @ T[:3, :3].T + T[:3, 3]
+            header, *fields = self.writer.cloud(stamp, points.astype(np.float32), None)
+            header.frame_id = "camera_init"
+            self.writer.write("/registered", stamp, CLOUD, header, *fields)
 
     def close(self) -> Path:
         self.writer.bag.close()
@@ -246,6 +258,29 @@ def test_repeated_stamps_are_named(tmp_path) -> None:
         assert world(BagLog(loop.close()), loop.recording) < 5e-3
 
 
+def test_a_loop_that_stops_midway_keeps_its_order(tmp_path, recwarn) -> None:
+    """The clock of the clouds is 10 % fast, so they arrive ever earlier by their stamps."""
+    loop = Recorder(tmp_path)
+    start = loop.stamps[0]
+    for sweeps, lag in ((range(8), 0), (range(4), 8 * 10**8)):
+        loop.clouds(sweeps, stamp=lambda stamp: stamp + (stamp - start) // 10, lag=lag)
+    log = BagLog(loop.close())
+    assert list(log.timestamps) == [start + k * 110_000_000 for k in range(8)]
+    assert not [each for each in recwarn if "set back" in str(each.message)]
+
+
+@pytest.mark.parametrize("unit", [1000, 1_000_000])
+def test_stamps_of_a_smaller_unit_are_replaced(tmp_path, unit: int) -> None:
+    """Microseconds and milliseconds that are written as nanoseconds; every other step is a little longer."""
+    bag = Recorder(tmp_path)
+    bag.mount()
+    bag.drive()
+    bag.clouds(stamp=lambda stamp: (stamp + bag.stamps.index(stamp) % 2 * 10**6) // unit)
+    with pytest.warns(CFlowWarning, match="so we use their times of arrival"):
+        log = BagLog(bag.close())
+    assert [time - 40_000_000 for time in log.timestamps] == list(bag.stamps)
+
+
 def test_corrections_of_a_map_do_not_move_the_ego(tmp_path) -> None:
     bag = Recorder(tmp_path)
     bag.mount()
@@ -289,20 +324,28 @@ def test_a_bad_transform_of_another_frame_stops_no_bag(tmp_path) -> None:
     assert world(BagLog(bag.close()), bag.recording) < 5e-3
 
 
-def test_a_clock_that_is_set_back_runs_on(tmp_path) -> None:
-    """The driver's clock, by NTP or PTP, in the middle of a recording, and one message that arrives late."""
-    bag = Recorder(tmp_path / "back")
+@pytest.mark.parametrize("sweep", range(1, 8))
+def test_a_clock_that_is_set_back_runs_on(tmp_path, sweep: int) -> None:
+    """The driver's clock, by NTP or PTP, anywhere in a recording."""
+    bag = Recorder(tmp_path)
     bag.mount()
     bag.drive()
-    bag.clouds(stamp=lambda stamp: stamp - 330_000_000 * (stamp >= bag.stamps[4]))
+    bag.clouds(stamp=lambda stamp: stamp - 330_000_000 * (stamp >= bag.stamps[sweep]))
     with pytest.warns(CFlowWarning, match=r"the clock of its clouds was set back by 0\.33 s"):
         log = BagLog(bag.close())
     assert list(log.timestamps) == list(bag.stamps) and world(log, bag.recording) < 5e-3
-    late = Recorder(tmp_path / "late")
+
+
+@pytest.mark.parametrize("sweep", range(6))
+def test_a_message_that_arrives_after_the_next_one_keeps_its_time(tmp_path, sweep: int) -> None:
+    """That before the last is not told from a clock that was set back."""
+    late = Recorder(tmp_path)
     late.mount()
     late.drive()
-    late.clouds([0, 1, 3, 2, 4, 5, 6, 7], stamp=lambda stamp: stamp)
-    assert len(BagLog(late.close())) == 8
+    late.clouds(k for k in range(8) if k != sweep)
+    late.clouds([sweep], lag=120_000_000)
+    log = BagLog(late.close())
+    assert list(log.timestamps) == list(late.stamps) and world(log, late.recording) < 5e-3
 
 
 def test_a_gap_splits_windows(tmp_path) -> None:
@@ -314,21 +357,37 @@ def test_a_gap_splits_windows(tmp_path) -> None:
         assert open_log("bags", bag.close()).gaps == {2}
 
 
-@pytest.mark.parametrize("has_odometry", [True, False])
-def test_clouds_in_the_frame_of_the_world_are_moved_to_the_vehicle(tmp_path, has_odometry: bool) -> None:
+@pytest.mark.parametrize(("has_odometry", "frames"), [(True, ["body"]), (False, ["body"]), (True, ["body", "camera"])])
+def test_clouds_in_the_frame_of_the_world_are_moved_to_the_vehicle(tmp_path, has_odometry: bool, frames: Any) -> None:
     bag = Recorder(tmp_path)
     if has_odometry:
         bag.odometry("body", "camera_init")
-    for k, stamp in enumerate(bag.stamps):
-        bag.transform(stamp, "camera_init", "body", bag.recording.pose_at(stamp))
-        T = bag.recording.pose_at(stamp)
-        points = bag.recording.units(k)[0].points @ T[:3, :3].T + T[:3, 3]
-        header, *fields = bag.writer.cloud(stamp, points.astype(np.float32), None)
-        header.frame_id = "camera_init"
-        bag.writer.write("/registered", stamp, CLOUD, header, *fields)
+    bag.registered(*frames)
     with pytest.warns(CFlowWarning, match="clouds are in camera_init, the frame of the world; we move them to body"):
         log = BagLog(bag.close())
     assert np.allclose(log.sweep(3).points, bag.recording.units(3)[0].points, atol=5e-3)
+    assert np.allclose(log.poses[3], bag.recording.pose_at(bag.stamps[3]))
+
+
+def test_of_two_frames_that_drive_in_the_frame_of_the_clouds_one_must_be_chosen(tmp_path) -> None:
+    bag = Recorder(tmp_path)
+    bag.registered("body", "camera")
+    path = bag.close()
+    with pytest.warns(CFlowWarning, match=r"body, camera move in camera_init, .*frame \(data.frame\)"):
+        assert BagLog(path).poses is None
+    log = BagLog(path, frame="body")
+    assert np.allclose(log.sweep(3).points, bag.recording.units(3)[0].points, atol=5e-3)
+
+
+def test_the_frame_of_a_lidar_that_carries_base_link_is_not_that_of_the_world(tmp_path, recwarn) -> None:
+    bag = Recorder(tmp_path)
+    bag.transform(bag.stamps[0], "velodyne", "base_link", np.linalg.inv(MOUNT))
+    for stamp in range(bag.stamps[0] - 10**8, bag.stamps[-1] + 10**8, STEP):
+        bag.transform(stamp, "odom", "velodyne", bag.recording.pose_at(stamp) @ MOUNT)
+    bag.clouds()
+    log = BagLog(bag.close())
+    assert log.frame == "base_link" and world(log, bag.recording) < 5e-3
+    assert not [each for each in recwarn if "frame of the world" in str(each.message)]
 
 
 LIVOX = {

@@ -125,6 +125,15 @@ class Frames:
         moving = [child for child in self.chain(frame)[:-1] if self.is_moving(child)]
         return next(filter(self._is_corrected, moving[1:]), self.chain(frame)[-1])
 
+    def moving_in(self, frame: str) -> list[str]:
+        """Return the frames that move, and are below a frame."""
+        return [child for child in self._samples if frame in self.chain(child)[1:] and self.is_moving(child)]
+
+    def drives_in(self, frame: str, other: str) -> bool:
+        """Test whether a frame moves in another one, or in one above that."""
+        links = set(self.chain(frame)).difference(self.chain(other))
+        return self.are_joined(frame, other) and any(map(self.is_moving, links))
+
     def _is_corrected(self, child: str) -> bool:
         """Test whether the transform to a frame are corrections: it jumps now and then, and is constant between."""
         changes = np.abs(np.diff(self._link(child)[1], axis=0)).max(axis=(1, 2))
@@ -140,7 +149,7 @@ class Frames:
         bases = [each for each in (*chain, *self._samples) if each.split("/")[-1] == BASE]
         base = next((each for each in bases if self.are_joined(each, frame)), "")
         moving = [child for child in chain if self.is_moving(child)]
-        inside = [child for child in self._samples if frame in self.chain(child)[1:] and self.is_moving(child)]
+        inside = self.moving_in(frame)
         if base or not moving or (inside and self._is_corrected(moving[0])):
             return base or (inside[0] if len(inside) == 1 else "")
         carrying = chain[: chain.index(moving[0]) + 1]

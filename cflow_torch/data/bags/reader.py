@@ -51,7 +51,8 @@ _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by less
 _LARGEST_DELAY = 500_000_000  # nanoseconds by which messages arrive later than others
 _EARLY = 100_000_000  # nanoseconds; a message that arrives so long before its time has another clock than the recorder
-_SLOWEST, _AROUND = 1000, 3  # times by which arrivals grow more than stamps; clouds around a fall of the stamps
+_SLOWEST = 100  # the factor by which arrivals grow faster than stamps, at least
+_AROUND = 3  # clouds before, and after, a fall of the stamps, at most
 _NEED = "bags need rosbags (extra bags): pip install rosbags"
 _LOST = "{} that are NaN or zeros are left out"
 
@@ -79,14 +80,16 @@ class BagLog(Log):
             first available of: transforms in which the ego frame moves, the only topic of these types, the only file in
             a folder near the bag that has poses at the times of the clouds, none.
         frame: name of the ego frame; None = the vehicle that carries the LiDAR or drives in the frame of the clouds,
-            see `Frames.vehicle_of`, else the LiDAR's own.
+            see `Frames.vehicle_of`, else the child of a topic that drives in it, else the LiDAR's own.
         ego_T_lidar: (4, 4), maps the frame of the clouds to the ego frame; None = from the transforms.
 
     Attributes:
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
         trajectory: times and `T_world_ego` of all transforms or messages, by which `DeskewedLog` moves points.
-        timestamps: nanoseconds from the header of each cloud, unless arrivals contradict them, see `_timed`. Clouds
-            before the first or after the last pose are left out.
+        timestamps: nanoseconds from the header of each cloud. If headers hardly change from one cloud to the next, they
+            are the times of arrival. If a clock was set back, it runs on. If the clocks of clouds and poses surely
+            differ, they are shifted to that of the poses. Each of these is said. Clouds before the first or after the
+            last pose are left out.
         topic, frame: the settings in use.
 
     Convention: points are in the ego frame, as measured (`open_log` de-skews them). Poses are interpolated at the time
@@ -261,18 +264,17 @@ class BagLog(Log):
     def _ego_frame(self) -> str:
         """Return the frame of the vehicle. Without transforms to the LiDAR, it is the LiDAR's own."""
         frames, lidar = self._frames, self._lidar
-        vehicle = frames.vehicle_of(lidar)
+        driven = [child for child in self._child.values() if frames.drives_in(child, lidar)]
+        vehicle = frames.vehicle_of(lidar) or next(iter(driven), "")
         if vehicle:
-            if lidar in frames.chain(vehicle)[1:]:  # an odometry that publishes registered clouds
+            if frames.drives_in(vehicle, lidar):  # an odometry that publishes registered clouds
                 self._note(f"its clouds are in {lidar}, the frame of the world; we move them to {vehicle}")
             return vehicle
         for name in filter(None, (BASE, *self._child.values())):
             is_in_tf = len(frames.change_times(name)) > 1
-            if (
-                self._mount is None
-                and not frames.are_joined(name, lidar)
-                and (is_in_tf or name in self._child.values())
-            ):
+            if frames.are_joined(name, lidar):
+                continue
+            if self._mount is None and (is_in_tf or name in self._child.values()):
                 self._note(
                     f"no transform connects its LiDAR ({lidar}) to {name}, whose poses it has. We assume that both are "
                     "in one place; pass the mounting of the LiDAR, ego_T_lidar (data.ego_T_lidar)",
@@ -281,6 +283,13 @@ class BagLog(Log):
             if is_in_tf:
                 self._mount = np.eye(4) if self._mount is None else self._mount
                 return name
+        moving = frames.moving_in(lidar)
+        if moving:
+            names = shortened(", ".join(moving))
+            self._note(
+                f"{names} move in {lidar}, the frame of its clouds. If one is the vehicle, choose it by frame "
+                "(data.frame)"
+            )
         return lidar
 
     def _scan(self) -> tuple[dict[int, tuple[int, int]], dict[str, list[Any]]]:
@@ -340,8 +349,8 @@ class BagLog(Log):
     def _timed(self, stamps: list[tuple[int, int]]) -> dict[int, tuple[int, int]]:
         """Return the arrival of each cloud by its time, and by how much the time differs from the stamp.
 
-        Stamps that hardly grow from one arrival to the next are replaced by the arrivals. If they fall, a clock was set
-        back, and we let it run on. We say both.
+        Stamps that hardly grow from one arrival to the next are replaced by the arrivals. If they fall, and the delays
+        grow at once, a clock was set back, and we let it run on. A note says what was done.
 
         Args:
             stamps: of each cloud, that of its header and its arrival, in the order of arrival.
@@ -351,14 +360,17 @@ class BagLog(Log):
             count = len(stamps) - sum(is_same)
             self._note(f"its {len(stamps)} clouds have {count} different time stamps, so we use their times of arrival")
             return {arrived: (arrived, arrived - stamp) for stamp, arrived in stamps}
-        first = list(dict(reversed(stamps)).items())[::-1]  # clouds that are played twice repeat their stamps
+        arrival: dict[int, int] = {}
+        for stamp, arrived in stamps:
+            arrival.setdefault(stamp, arrived)  # clouds that are played twice repeat their stamps
+        first = list(arrival.items())
         if len(first) < len(stamps):
             count = len(stamps) - len(first)
             self._note(f"{count} clouds repeat the time stamp of an earlier one and are left out; was it played twice?")
         delay = [arrived - stamp for stamp, arrived in first]
         shift = np.zeros(len(first), np.int64)
-        for k in range(_AROUND, len(first) - _AROUND + 1):
-            before, after = sorted(delay[k - _AROUND : k]), sorted(delay[k : k + _AROUND])
+        for k in range(1, len(first)):
+            before, after = sorted(delay[max(k - _AROUND, 0) : k]), sorted(delay[k : k + _AROUND])
             jump, spread = after[0] - before[-1], max(after[-1] - after[0], before[-1] - before[0])
             if first[k][0] < first[k - 1][0] and jump > spread:  # else messages arrived late
                 back = _middle(after) - _middle(before)
