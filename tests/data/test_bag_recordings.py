@@ -324,7 +324,7 @@ def test_a_bad_transform_of_another_frame_stops_no_bag(tmp_path) -> None:
     assert world(BagLog(bag.close()), bag.recording) < 5e-3
 
 
-@pytest.mark.parametrize("sweep", range(1, 8))
+@pytest.mark.parametrize("sweep", range(1, 7))
 def test_a_clock_that_is_set_back_runs_on(tmp_path, sweep: int) -> None:
     """The driver's clock, by NTP or PTP, anywhere in a recording."""
     bag = Recorder(tmp_path)

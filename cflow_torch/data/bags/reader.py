@@ -369,7 +369,7 @@ class BagLog(Log):
             self._note(f"{count} clouds repeat the time stamp of an earlier one and are left out; was it played twice?")
         delay = [arrived - stamp for stamp, arrived in first]
         shift = np.zeros(len(first), np.int64)
-        for k in range(1, len(first)):
+        for k in range(1, len(first) - 1):  # a late message would look like a step before the last cloud
             before, after = sorted(delay[max(k - _AROUND, 0) : k]), sorted(delay[k : k + _AROUND])
             jump, spread = after[0] - before[-1], max(after[-1] - after[0], before[-1] - before[0])
             if first[k][0] < first[k - 1][0] and jump > spread:  # else messages arrived late
