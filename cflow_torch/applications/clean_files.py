@@ -10,7 +10,7 @@ import numpy as np
 from cflow_torch.applications.cleaning import CleanLog
 from cflow_torch.data.arrays import ArraysLog
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, copy_rows
-from cflow_torch.data.arrays.writer import POINTS_FOLDER, SweepSides, cloud_name, write_sides, write_sweep
+from cflow_torch.data.arrays.writer import POINTS_FOLDER, SweepSides, cloud_names, write_sides, write_sweep
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
@@ -65,14 +65,12 @@ def write_clean_log(
         raise CFlowError(f"suffix={suffix}: give one of {', '.join(SUFFIXES)}")
     own = log.unwrapped
     viewpoint = _viewpoint(log, suffix)
+    names = cloud_names(log)
     total = Removed(0, 0, 0)
     sides = {}
     with new_folder(root, log.log_id, replace) as folder:
         (folder / REMOVED_FOLDER).mkdir()
-        for index in range(len(log.timestamps)):
-            name = cloud_name(log, index)
-            if name in sides:
-                raise CFlowError(f"log {log.log_id}: two of its sweeps have the number {name}")
+        for index, name in enumerate(names):
             file = folder / POINTS_FOLDER / f"{name}{suffix}"
             removed = clean.removed(index)
             moving = int(clean.moving(index).sum())
@@ -108,9 +106,10 @@ def own_suffix(log: Log) -> str:
 
 def stored_masks(folder: Path, log: Log) -> Callable[[int], np.ndarray]:
     """Return a function that reads the mask of a sweep which `write_clean_log` wrote to `folder`."""
+    names = cloud_names(log)
 
     def read(index: int) -> np.ndarray:
-        file = folder / REMOVED_FOLDER / f"{cloud_name(log, index)}.npy"
+        file = folder / REMOVED_FOLDER / f"{names[index]}.npy"
         rows = len(log.sweep(index).points)
         mask = read_npy(file, _WRITE_AGAIN)
         if mask.shape != (rows,) or mask.dtype != bool:

@@ -148,7 +148,7 @@ def _check_logs(folder: Path, record: Mapping[str, Any], logs: Sequence[Log], so
     if changed:
         names = ", ".join(sorted(changed))
         raise CFlowError(
-            f"{folder} has scores of other data: {names} was added, removed or changed; give overwrite=true, or give "
+            f"{folder} has scores of other data (added, removed or changed: {names}): give overwrite=true, or "
             "output=FOLDER"
         )
 

@@ -83,7 +83,7 @@ class Pixels:
 class Columns:
     """The columns of B windows, and of B windows of copies.
 
-    `lattice` numbers the cells of images, and only this class knows how slots are numbered.
+    `lattice` numbers the cells of the images. Only this class knows how slots and entries of `rank` are numbered.
 
     The image of a window has an empty border of `BORDER` cells (b), so that only distant cells need a test:
 
@@ -126,7 +126,7 @@ class Columns:
         cell = _inside(is_column, lattice)  # [C]
         for reach in range(2, spacing.most + 1):
             cell = _grow(is_column, cell, grid, spacing, reach)
-        # Column 0 is said to be in the border, in the last place of its second row: it has only border around it.
+        # The cell of column 0 is the last one of the second row. It is in the border, and so are all cells around it.
         cell = torch.cat((constant((2 * lattice.stride - 1,), torch.int64, device), cell))
         reach_of, tall = _reach_and_tall(grid, cell, spacing)
         num_slots = _WORD * -(-num_steps // _WORD)
@@ -159,7 +159,8 @@ class Columns:
             around = self.cell.index_select(0, flat_nonzero(is_near)) + self.lattice.square(1, column.device)
             beside = self.image.index_select(0, around.view(-1)).long()
             if self.reach is not None:  # other windows of the batch may have a larger one
-                beside = beside * (self.reach.index_select(0, beside) >= reach)
+                is_nearer = self.reach.index_select(0, beside) < reach
+                beside = beside.masked_fill(is_nearer, 0)  # the empty column
             mark(is_near, beside)
         is_near[0] = True  # the empty column stays the first one
         near = flat_nonzero(is_near)
@@ -252,10 +253,14 @@ class Columns:
         column = self.column_of(pixels)
         cell = self.cell.index_select(0, column) + self.lattice.square(reach, column.device)
         beside = self.image.index_select(0, cell.view(-1)).view_as(cell)  # [(2 reach + 1)^2, K]
-        return self.pixel_at((beside + pixels.step * len(self.cell)).view(-1), count)
+        return self.pixel_at(self.entry(pixels.step, beside).view(-1), count)
+
+    def entry(self, step: Tensor | int, column: Tensor) -> Tensor:
+        """Return the entries of `rank` of sweeps in columns, in the shape and dtype of both together."""
+        return column + step * len(self.cell)
 
     def pixel_at(self, entry: Tensor, count: int) -> Groups:
-        """Group K entries of `rank`, step * (C + 1) + column, (K,), by their pixel, one of `count` in the list."""
+        """Group K entries of `rank`, (K,), by their pixel, one of `count` in the list."""
         rank = self.rank.view(-1).index_select(0, entry).long()
         return Groups(rank.clamp_(max=count), count)
 
@@ -337,13 +342,12 @@ class Columns:
         self.slices.view(torch.int64).copy_(words | self._or_within_reach(words) << NUM_SLICES)
         drawn = slices.t().contiguous()  # [S, C + 1]
         step, column = nonzero_pairs(drawn.bool())
-        entry = step * len(self.cell) + column
+        entry = self.entry(step, column)
         number = torch.arange(pixels_before, pixels_before + len(entry), dtype=torch.int32, device=entry.device)
         self.rank.view(-1).index_copy_(0, entry, number)
         first_slot = (column + columns_before) * self.num_slots
         window, row_col = self.lattice.split(self.cell.index_select(0, column))
-        start = window * self.lattice.area + self.lattice.first
-        place = torch.stack((first_slot, start, window, step, *row_col), 1)
+        place = torch.stack((first_slot, self.lattice.start(window), window, step, *row_col), 1)
         # With copies, there are at most twice as many columns.
         dtype = index_dtype(max(len(self.image), 2 * self.slices.numel()), place.device)
         return Pixels(place.to(dtype), drawn.view(-1).index_select(0, entry))
@@ -360,19 +364,20 @@ class Columns:
     def are_filled(self, pixels: Pixels, step: Tensor | int, shift: Tensor | None = None) -> Tensor:
         """Tell where another sweep has slices, but no pixel, see `fill`: bool, with the arguments of `look_up`."""
         has_slices = self.look_up(pixels, step, shift) & OWN > 0
-        first = step * len(self.cell)  # entry of `rank`
         if shift is None:
-            entry = self.column_of(pixels) + first  # [K]
+            entry = self.entry(step, self.column_of(pixels))  # [K]
         else:
-            entry = self._column_at(pixels, shift) + (first[:, None] if isinstance(first, Tensor) else first)  # [K, C]
+            of_pixel = step[:, None] if isinstance(step, Tensor) else step
+            entry = self.entry(of_pixel, self._column_at(pixels, shift))  # [K, C]
         return has_slices & (self.rank.view(-1).index_select(0, entry.view(-1)).view_as(entry) == _EMPTY)
 
 
 def _inside(is_column: Tensor, lattice: Lattice) -> Tensor:
     """Clear the borders of images, (B * area,) bool, and list the cells that remain, (C,) int64."""
-    images = is_column.view(-1, lattice.height + 2 * BORDER, lattice.stride)
-    images[:, :BORDER] = images[:, -BORDER:] = False
-    images[:, :, :BORDER] = images[:, :, -BORDER:] = False
+    border = lattice.border
+    images = is_column.view(-1, lattice.height + 2 * border, lattice.stride)
+    images[:, :border] = images[:, -border:] = False
+    images[:, :, :border] = images[:, :, -border:] = False
     return flat_nonzero(is_column)
 
 

@@ -60,7 +60,8 @@ def motion_margin(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigi
     is_far = rigid.centre.square().sum(1) >= float(TABLE["far"]) ** 2
     has_history = sweeps.has_history.index_select(0, objects.window)
     margin = _margins(sweeps, tree, objects, rigid, is_fast)
-    bins = Bins.moving + (4 * has_history + 2 * is_far + is_fast) * Bins.num_margins + bin_of(margin, TABLE["margin"])
+    row = 4 * has_history + 2 * is_far + is_fast
+    bins = Bins.moving + row * Bins.num_margins + bin_of(margin, TABLE["margin"])
 
     moving = constant(tuple(TABLE["moving"]), torch.float32, bins.device).index_select(0, bins)
     least = constant(_LEAST_LIKELY, torch.float32, bins.device).index_select(0, 2 * has_history + is_fast)

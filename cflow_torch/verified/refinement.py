@@ -168,7 +168,7 @@ class Source:
             offset=position[:2] - centre,
             height=position[2:],
             covariance=take_columns(covariance, voxel) + noise,
-            target_start=window * voxels.num_steps * voxels.lattice.area + voxels.lattice.first,
+            target_start=voxels.lattice.start(window * voxels.num_steps),  # of t+1
             target_layers=((voxels.layer.index_select(0, voxel) + up) % NUM_LAYERS).int(),
             elapsed=elapsed[window, voxels.step.index_select(0, voxel)],
         )

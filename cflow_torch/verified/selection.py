@@ -162,15 +162,13 @@ def _keys_of_components(components: Components, first: int, num_pixels: int) -> 
 
 
 def number_objects(sweeps: HeightSlicedSweeps, by_key: Groups, num_nodes: int = 0) -> Objects:
-    """Number the objects in order of window, and of their first pixel.
+    """Number the objects in order of their first pixel in the list.
 
     `by_key` groups the P' pixels. The first `num_nodes` groups are objects that are nodes, the others are components.
     """
     first = by_key.first()
     used = flat_nonzero(first < len(by_key.of_item))
-    first = first[used]
-    window = sweeps.pixels.window[first]
-    order = (window * sweeps.num_pixels + first).argsort()
+    first, order = first[used].sort()
     used = used[order]
     by_node = Groups(used.clamp(max=num_nodes), num_nodes)
-    return Objects(by_key.select(used), by_node, window[order])
+    return Objects(by_key.select(used), by_node, sweeps.pixels.window[first])

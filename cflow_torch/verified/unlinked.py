@@ -127,7 +127,7 @@ class _Map:
     """A map of each sweep with a part in each cell; of several parts, the last one."""
 
     def __init__(self, sweeps: HeightSlicedSweeps, parts: _Parts) -> None:
-        self._side = max(1, round(_CELL / sweeps.grid.pixel_size))  # finest pixels
+        self._side = sweeps.grid.whole_pixels(_CELL)  # finest pixels
         # A border as wide as the farthest neighbours, so that they need no tests.
         self._lattice = sweeps.grid.lattice(self._side, border=_REACH)
         self._num_steps = sweeps.num_steps

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import zlib
-from functools import cached_property
 from typing import Any, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -142,21 +141,20 @@ class PackedDrive:
 
     def clouds(self) -> Iterator[str]:
         """The points of each frame and their entries in the colourings of `content`, compressed, as texts."""
-        names = [coloring["name"] for coloring in self._shown_colorings]
+        names = [coloring["name"] for coloring in self._shown_colorings()]
         for units, entries, _ in self.points:
             missing = np.where(entries["flow"] == GROUND, GROUND, UNKNOWN).astype(np.uint8)
             yield packed(_planes(units, [entries.get(name, missing) for name in names]))
 
-    @cached_property
     def _shown_colorings(self) -> list[dict[str, Any]]:
-        """The colourings that the page offers. Read it after the last `add`."""
+        """Return the colourings that the page offers."""
         interval = float(np.median([frame["interval"] for frame in self.frames]))
         present = set().union(*(entries for _, entries, _ in self.points))
         return [row for row in _colorings(self.max_flow, interval) if row["name"] in present]
 
     def content(self) -> dict[str, Any]:
         """The input of the page's script: frames without their points, colourings, and texts."""
-        chosen = self._shown_colorings
+        chosen = self._shown_colorings()
         shown = sum(frame["count"] for frame in self.frames)
         side = self.voxel
         T = self.frame.T_world_viewer

@@ -183,7 +183,7 @@ def test_a_second_eval_prints_its_tables(log_folder, tmp_path, cflow, capsys):
     assert "| **mean**" in texts[0] and "skipped, its results exist" in texts[1]
     assert texts[1].endswith(texts[0].partition("\n")[2])
     next((log / "sensors" / "lidar").iterdir()).unlink()
-    assert cflow(*call) == 2 and "was added, removed or changed" in capsys.readouterr().err, "the log has changed"
+    assert cflow(*call) == 2 and "(added, removed or changed: " in capsys.readouterr().err, "the log has changed"
 
 
 def test_a_warning_is_shown_once(monkeypatch: Any, capsys: Any) -> None:

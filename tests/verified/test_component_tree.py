@@ -138,21 +138,21 @@ def test_the_cut_equals_the_oracle(seed, of_evidence):
     node = objects.by_node.of_item
     first = objects.by_object.first()
     assert torch.equal(objects.window, found.sweeps.pixels.window[first])
-    order = list(zip(objects.window.tolist(), first.tolist()))
-    assert order == sorted(order)
-    start = 0
+    assert torch.equal(first, first.sort().values)
+    count = 0
     for window, tree in enumerate(found.trees):
         own = found.names(window)
         verdicts = zip(*[verdict_of[window, name] for name in own])
         expected, chosen = oracle.select_objects(found.windows[window], tree, *verdicts, 0.0)
         mine = objects.by_object.of_item[found.sweeps.pixels.window == window]
-        numbers = torch.where(mine < objects.count, mine - start, -1).tolist()
-        assert numbers == expected.tolist()
-        of_window = node[start : start + len(chosen)].tolist()
+        is_own = objects.window == window
+        number = torch.cat((is_own.cumsum(0) - 1, torch.tensor([-1])))  # in the window; the last one for no object
+        assert number[mine].tolist() == expected.tolist()
+        of_window = node[is_own].tolist()
         expected_names = [None if i < 0 else own[i] for i in chosen]
         assert [names[i] if i < len(names) else None for i in of_window] == expected_names
-        start += len(chosen)
-    assert start == objects.count
+        count += len(chosen)
+    assert count == objects.count
 
 
 @pytest.mark.parametrize("whole, wins", [(0, False), (71, False), (72, False), (73, True)])

@@ -234,7 +234,7 @@ def test_objects_leaves_out_what_is_probably_static():
 
 @pytest.mark.slow
 def test_dropping_points_of_low_confidence_lowers_the_error():
-    """Four crossings together: in a single drive, hardly anything may be wrong."""
+    """We need four crossings, because a single drive may have hardly any errors."""
     of_drives = [_errors_of(make_drive(seed=seed, num_sweeps=8, scene="crossing")) for seed in range(11, 15)]
     error, told, moves = (np.concatenate(values) for values in zip(*of_drives))
     for kind in (moves, ~moves):
@@ -257,7 +257,7 @@ def _errors_of(drive):
 
 @pytest.mark.slow
 def test_what_moves_in_a_real_drive_is_told_from_bushes(kitti_file):
-    """What fits simulated drives better may fit real ones worse: with rows of low and of tall objects, it is .89."""
+    """A table that fits simulated drives better may fit real ones worse. With rows of tall objects, the IoU is .89."""
     hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
     file = kitti_file.with_name("kitti-0000-c2.h5")
     if not file.exists():

@@ -43,7 +43,7 @@ def test_cells_are_numbered_image_after_image_in_raster_order():
     split = lattice.split(numbers)
     assert torch.equal(split[0], image) and torch.equal(split[1], torch.stack((row, col)))
     assert lattice.split(torch.tensor([0]))[1].tolist() == [[-1], [-1]]  # in the border
-    assert (lattice.first, lattice.area) == (6, 20)
+    assert (lattice.start(0), lattice.start(1), lattice.area) == (6, 26, 20)
     assert (12 + lattice.square(1, torch.device("cpu"))[:, 0]).tolist() == [6, 7, 8, 11, 12, 13, 16, 17, 18]
     grid = Grid(0.5, (0.0, 0.0, -1.0), (4.0, 2.0, 1.0))  # 5 rows and 9 columns
     assert grid.lattice() == Lattice(5, 9) and grid.lattice(2, border=1) == Lattice(3, 5, 1)

@@ -59,23 +59,31 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", viewpoint:
         raise CFlowError(f"viewpoint={viewpoint!r} with suffix={suffix!r}: pass 'sensor' or 'world' with .pcd, or None")
     if suffix not in SUFFIXES:
         raise CFlowError(f"suffix={suffix!r}: pass one of {', '.join(SUFFIXES)}")
+    names = cloud_names(log)
     sides = {}
     with new_folder(root, log.log_id) as folder:
-        for index in range(len(log.timestamps)):
+        for index, name in enumerate(names):
             sweep = log.sweep(index)
-            name = cloud_name(log, index)
-            if name in sides:
-                raise CFlowError(f"log {log.log_id}: two of its sweeps have the number {name}")
             write_sweep(folder / POINTS_FOLDER / f"{name}{suffix}", log, index, sweep, viewpoint)
             sides[name] = SweepSides.of(sweep)
         write_sides(folder, log.log_id, sides, has_viewpoints=viewpoint is not None)
     return Path(root) / log.log_id
 
 
-def cloud_name(log: Log, index: int) -> str:
-    """Return the name of the cloud of sweep `index` without a suffix: that of its file, or its number."""
+def cloud_names(log: Log) -> list[str]:
+    """Return the names of the clouds of a log, without a suffix: those of its files, or their numbers.
+
+    Two equal ones are a `CFlowError`.
+    """
     own = log.unwrapped
-    return stem_of(own.files[index]) if isinstance(own, ArraysLog) else f"{log.frame_number(index):06d}"
+    if isinstance(own, ArraysLog):
+        names = [stem_of(file) for file in own.files]
+    else:
+        names = [f"{log.frame_number(index):06d}" for index in range(len(log.timestamps))]
+    if len({*names}) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise CFlowError(f"log {log.log_id}: two of its sweeps have the number {twice}")
+    return names
 
 
 def write_sweep(file: Path, log: Log, index: int, sweep: Sweep, viewpoint: str | None) -> None:
