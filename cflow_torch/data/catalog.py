@@ -20,6 +20,7 @@ from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, exist, is_path_like, remote_errors, safe_name, suffix_of
 from cflow_torch.data.read_as import read_as as read_log_as
+from cflow_torch.errors import warn
 from cflow_torch.ground.segmentation import GROUND_METHODS, has_ground
 from cflow_torch.ground.segmentation import find_ground as ground_of
 from cflow_torch.setting import AUTO
@@ -92,6 +93,8 @@ def recognise(root: Any) -> str:
 
     Raises:
         CFlowError: the path does not exist, or no format fits, or several do.
+
+    Cost: next to folders of point clouds, the first log is opened.
     """
     top = as_path(root)
     with remote_errors(top):
@@ -108,8 +111,12 @@ def recognise(root: Any) -> str:
             level = [path for folder in level for path in visible(folder)]
     found = [name for name in found if _has_logs(name, root)]  # nuScenes and TruckScenes have the same file names
     if found and any(_has_clouds(path, top) for path in marked):  # folders of other data sets may be called so
-        opened = [name for name in found if _opens(name, root)]
-        found = ["arrays"] if not opened and _opens("arrays", root) else opened or found
+        errors = {name: _error_of(name, root) for name in found}
+        opened = [name for name in found if not errors[name]]
+        if not opened and not _error_of("arrays", root):
+            warn(f"{root}: we read its folders of clouds, because no log of another format opens: {errors[found[0]]}")
+            opened = ["arrays"]
+        found = opened or found
     if not found and _has_logs("arrays", root):
         found = ["arrays"]
     if len(found) != 1:
@@ -211,13 +218,13 @@ def _has_logs(name: str, root: Any) -> bool:
         return False
 
 
-def _opens(name: str, root: Any) -> bool:
-    """Test whether the first log under a path can be opened in a format."""
+def _error_of(name: str, root: Any) -> str:
+    """Return the error if the first log under a path cannot be opened in a format; "" = it opens."""
     try:
         _open(name, find_sources(name, root)[0], {}).close()
-        return True
-    except CFlowError:
-        return False
+        return ""
+    except CFlowError as error:
+        return str(error)
 
 
 def find_user_sources(target: str, settings: Mapping[str, Any]) -> list[UserSource]:

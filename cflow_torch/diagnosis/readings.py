@@ -369,7 +369,8 @@ def _readings_of_motions(pairs: Sequence[Pair], scan: str, motions: Sequence[np.
             found[MOUNTED] = _mounting(rotation, place)
     elif turn_of(rotation) > _SLIGHT:
         is_better = np.linalg.norm(given - fitted @ rotation.T, axis=1) < np.linalg.norm(given - fitted, axis=1)
-        found.update({MOUNTED: _mounting(rotation, np.zeros(3))} if is_better.all() else {})  # not only in turns
+        if is_better.all():  # not only in turns
+            found[MOUNTED] = _mounting(rotation, np.zeros(3))
     if not is_turned and np.linalg.norm((fitted - given)[:, :2], axis=1).max() > _SMALLEST_ERROR:
         found[MOUNT] = _mounting(axes, _place_of(pairs, scan, axes))
     found.update({name: READINGS[name] for name, unit in UNITS.items() if 1 / _OF_UNIT < scale / unit < _OF_UNIT})
@@ -410,13 +411,15 @@ def _mounting(rotation: np.ndarray, place: np.ndarray) -> Reading:
     causes = []
     fixes = []
     where = "data.ego_T_lidar with"
-    if turn_of(rotation) > 0 and rotation[2, 2] > np.cos(_LEVEL):
-        degrees = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
+    yaw = float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+    tilt = turn_of(rotations_about(2, -yaw) @ rotation)
+    if turn_of(rotation) > 0 and tilt < min(abs(yaw), _LEVEL):
+        degrees = np.degrees(yaw)
         side = "left" if degrees > 0 else "right"
         causes.append(f"the points' x axis points about {abs(degrees):.0f} degrees to the {side} of the poses'")
         fixes.append(f"a rotation of about {degrees:.0f} degrees about z")
     elif turn_of(rotation) > 0:
-        names = [_DIRECTIONS[axis][int(row[axis] < 0)] for row in rotation for axis in [int(np.abs(row).argmax())]]
+        names = [_direction(row) for row in rotation]
         if names == [same for same, _ in _DIRECTIONS]:
             causes.append(f"the points are turned by about {np.degrees(turn_of(rotation)):.0f} degrees")
         else:
@@ -429,6 +432,12 @@ def _mounting(rotation: np.ndarray, place: np.ndarray) -> Reading:
         fixes.append(f"a position of about {' and '.join(named)}")
     fix = f"{where} {' and '.join(fixes)} (data=arrays, hdf5 or bags)"
     return Reading(", and ".join(causes), partial(_seen_from, as_matrix(rotation, place)), fix=fix)
+
+
+def _direction(axis: np.ndarray) -> str:
+    """Return the name of the direction that is nearest to an axis, (3,)."""
+    largest = int(np.abs(axis).argmax())
+    return _DIRECTIONS[largest][int(axis[largest] < 0)]
 
 
 def _seen_from(ego_T_points: np.ndarray, steps: np.ndarray) -> np.ndarray:

@@ -281,6 +281,17 @@ def test_stamps_of_a_smaller_unit_are_replaced(tmp_path, unit: int) -> None:
     assert [time - 40_000_000 for time in log.timestamps] == list(bag.stamps)
 
 
+def test_a_header_of_0_takes_the_time_of_arrival(tmp_path) -> None:
+    bag = Recorder(tmp_path)
+    bag.mount()
+    bag.drive()
+    bag.clouds(stamp=lambda stamp: 0 if stamp == bag.stamps[3] else stamp)
+    log = BagLog(bag.close())
+    late = [time - stamp for time, stamp in zip(log.timestamps, bag.stamps)]
+    assert late == [40_000_000 * (index == 3) for index in range(8)]
+    assert len(log.sweep(3).points) > 100
+
+
 def test_corrections_of_a_map_do_not_move_the_ego(tmp_path) -> None:
     bag = Recorder(tmp_path)
     bag.mount()

@@ -22,7 +22,7 @@ from cflow_torch.data.log_check import FOUND, RIGHT, WRONG, check_log, examine, 
 from cflow_torch.data.log_motion import JUMP, POSE, find_lapses, judge_log
 from cflow_torch.data.read_as import read_as
 from cflow_torch.diagnosis.conventions import AXES, CAMERA, UNITS, WORLD
-from cflow_torch.diagnosis.readings import GIVEN, NO_READING, UNKNOWN, _compare
+from cflow_torch.diagnosis.readings import GIVEN, NO_READING, UNKNOWN, _compare, _mounting
 from cflow_torch.errors import MissingFile
 from cflow_torch.simulator import make_drive
 from cflow_torch.transforms import (
@@ -220,8 +220,9 @@ def test_wrong_poses_are_named_and_the_reading_undoes_them(reading, source, requ
 def test_a_small_tilt_is_told_as_a_turn_of_that_size(drive):
     """As 0 degrees about z, it would be no help."""
     wrong = Wrong(drive, poses=each(lambda pose: pose @ as_matrix(rotations_about(1, np.radians(9.5)))))
-    texts = find_problems(wrong)
-    assert not any("points about 0 degrees" in text for text in texts)
+    assert any("turned by about 10 degrees" in text for text in find_problems(wrong))
+    tilted = _mounting(rotations_about(1, np.radians(4)), np.zeros(3))
+    assert "turned by about 4 degrees" in tilted.cause
 
 
 @pytest.mark.parametrize("name", ["mirrored", "swapped", "swapped_back"])
@@ -788,7 +789,7 @@ def test_poses_of_the_lidar_are_told_from_those_of_the_vehicle(drive, tmp_path):
         write_array_log(Wrong(level, poses=lambda _, poses=poses: poses, masks=False, name=name), tmp_path)
         log = ArraysLog(tmp_path / name, ego_T_lidar=tilt)
         assert np.allclose(log.poses, drive.poses, atol=1e-6)
-        assert any("poses fit those of the LiDAR" in note for note in log.notes) == (name == "lidar")
+        assert any("its poses are those of the LiDAR" in note for note in log.notes) == (name == "lidar")
     sensor = ArraysLog(tmp_path / "ego", ego_T_lidar=tilt, poses_of="sensor")
     assert np.allclose(sensor.poses, drive.poses @ tilt, atol=1e-6)
     bare = ArraysLog(tmp_path / "ego", poses=None, ego_T_lidar=tilt, poses_of="sensor")

@@ -979,6 +979,8 @@ def test_poses_of_another_log_and_poses_that_do_not_fit_are_not_taken(tmp_path):
     (tmp_path / "poses" / "README.md").write_text("of all logs")
     (tmp_path / "poses" / "A.txt").write_text(poses)
     assert ArraysLog(tmp_path / "sequences" / "A").poses is not None
+    (tmp_path / "sequences" / "A" / "poses.txt").write_text(poses.replace("1 0 0 2", "1 0 0 5"))  # as SemanticKITTI
+    assert ArraysLog(tmp_path / "sequences" / "A").poses[2, 0, 3] == 5, "poses.txt comes first"
     (tmp_path / "sequences" / "B" / "poses.txt").write_text(poses + "\n1 0 0 9 0 1 0 0 0 0 1 0")
     (tmp_path / "sequences" / "B" / "imu.txt").write_text(poses)
     with pytest.raises(CFlowError, match="has 4 poses for 3 sweeps"):

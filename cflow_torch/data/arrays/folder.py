@@ -269,25 +269,25 @@ def find_poses(
         fits: tests whether poses belong to the sweeps.
         tell: is called with what the user should know.
 
-    Convention: a file with one of `POSE_FILES`, and KITTI's `../../poses/NAME.txt`, is used without a test. Of several
+    Convention: a file with one of `POSE_FILES`, else KITTI's `../../poses/NAME.txt`, is used without a test. Of several
         other files that fit, those with poses at exactly the times of the sweeps count, near a log first those with its
         name. If several are left in the folder, that is a `CFlowError`; near it, none is used. A text in the folder of
         a log is returned if nothing fits, because it should.
     """
-    folders = dict.fromkeys([folder, *(path.parent for path in clouds[:1])])
-    own = [path for each in folders for path in find_pose_files(each, frozenset(clouds))]
+    folders = list(dict.fromkeys([folder, *(path.parent for path in clouds[:1])]))
     top = folder.resolve()
     kitti = top.parent.parent / "poses" / f"{top.name}.txt"
-    called = [path for path in own if path.name in POSE_FILES]
-    named = only_one([*called, *([kitti] if kitti.exists() else [])], folder, "poses")
-    if named is not None:
-        return read_poses(named)
+    called = [each / name for each in folders for name in POSE_FILES if (each / name).exists()]
+    named = only_one(called, folder, "poses")
+    if named is not None or kitti.exists():
+        return read_poses(named or kitti)
+    own = [path for each in folders for path in find_pose_files(each, frozenset(clouds))]
     read = read_all(own, read_poses, tell)
     found = {path: each for path, each in read.items() if fits(each)}
     near = None if found else find_poses_near(folder, top.name, times_ns, fits, tell, clouds)
     if near is None and not found:
         found = {path: each for path, each in read.items() if suffix_of(path) in _NEAR_TABLES}
-    file = only_one(_preferred(found, [], times_ns), folder, "poses")
+    file = only_one(_preferred(found, (), times_ns), folder, "poses")
     if file is None:
         return near
     tell(f"its poses are those of {file.name}")

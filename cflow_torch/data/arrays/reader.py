@@ -54,8 +54,8 @@ class ArraysLog(Log):
             each `.npz` file, or the only file of text in a folder near this one that has poses at the unix times of the
             sweeps; None = no poses; or a file (see `read_poses`); or a (K, 4, 4) array.
         poses_of: whose poses these are: "ego", "lidar", or "sensor" = of another sensor. Then `ego_T_lidar` maps to
-            this sensor, the ego frame is the LiDAR's, and the points stay. "auto" = of the LiDAR if the static world
-            then stands still clearly better, else "ego".
+            this sensor, the ego frame is the LiDAR's, and the points stay. "auto" = of the LiDAR if `ego_T_lidar` is
+            given and the static world then stands still clearly better, else "ego".
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
         times: "auto" = times.txt in the folder, or see `timestamps`; None = none; or a file with one time per sweep.
@@ -126,12 +126,12 @@ class ArraysLog(Log):
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
         self.poses = None if trajectory is None else self._pose_per_sweep(_of_ego(trajectory, whose, mounting), stamps)
-        if whose == "auto" and ego_T_lidar is not None and self.poses is not None:
-            self._ask_whose_poses()
         self.gaps |= frozenset(self._gaps_in_numbers())
         self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAYS))
         if trajectory is not None and self.has_viewpoints:
             self._note(f"its poses come from {trajectory.source}")
+        if whose == "auto" and ego_T_lidar is not None and self.poses is not None:
+            self._ask_whose_poses()
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and times where they are known."""
@@ -205,7 +205,7 @@ class ArraysLog(Log):
         if calibration == "auto" and values.keys().isdisjoint(CAMERA_KEYS):
             fix = "if they are KITTI's poses of a camera, download data_odometry_calib.zip, which has it"
             self._note(f"{chosen.name} has no Tr, so we take the poses for those of the LiDAR: {fix}")
-            return trajectory, poses_of
+            return trajectory, "lidar"
         T_cam_lidar = transform(values, chosen, *CAMERA_KEYS)
         converted = np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar
         if calibration == "auto" and _drives_along_x(trajectory.poses) and not _drives_along_x(converted):
@@ -225,9 +225,7 @@ class ArraysLog(Log):
         except (CFlowError, OSError):  # `sweep` raises the error of the sweep that cannot be read
             return
         if are_of_lidar:
-            self._note(
-                "its poses fit those of the LiDAR, so we take them for these; set data.poses_of=lidar to confirm it"
-            )
+            self._note("its points fit better if its poses are those of the LiDAR; data.poses_of=lidar confirms it")
             self.poses = others
             self.trajectory = self.trajectory and (self.trajectory[0], self.trajectory[1] @ lidar_T_ego)
 

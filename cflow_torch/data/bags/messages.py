@@ -135,23 +135,26 @@ class Frames:
         return self.are_joined(frame, other) and any(map(self.is_moving, links))
 
     def _is_corrected(self, child: str) -> bool:
-        """Test whether the transform to a frame are corrections: it jumps now and then, and is constant between."""
+        """Test whether the transform to a frame is a correction (map to odom): constant, but for a few jumps."""
         changes = np.abs(np.diff(self._link(child)[1], axis=0)).max(axis=(1, 2))
         return child.split("/")[-1] == "odom" or bool((changes < _CONSTANT).mean() > 0.5)
 
     def vehicle_of(self, frame: str) -> str:
         """Return the frame of the vehicle that carries a frame, or that drives in it; "" = none is known.
 
-        It is base_link. Else, of the frames from the given one to the moving one that carries it, it is the first whose
-        z axis points up. If none moves, the given one may be that of the world: then it is the only moving one in it.
+        The vehicle is base_link, if it is connected. Otherwise it is the first frame with z up on the way from the
+        given one to the moving frame that carries it. If no frame carries it, it may be that of the world. The vehicle
+        is then the only frame that moves in it.
         """
         chain = self.chain(frame)
         bases = [each for each in (*chain, *self._samples) if each.split("/")[-1] == BASE]
         base = next((each for each in bases if self.are_joined(each, frame)), "")
         moving = [child for child in chain if self.is_moving(child)]
         inside = self.moving_in(frame)
-        if base or not moving or (inside and self._is_corrected(moving[0])):
-            return base or (inside[0] if len(inside) == 1 else "")
+        if base:
+            return base
+        if not moving or (inside and self._is_corrected(moving[0])):
+            return inside[0] if len(inside) == 1 else ""
         carrying = chain[: chain.index(moving[0]) + 1]
         up = [float(self.in_root(each, self._link(moving[0])[0])[:, 2, 2].mean()) for each in carrying]
         return next(each for each, share in zip(carrying, up) if share >= max(up) - _SLIGHTLY_TILTED)

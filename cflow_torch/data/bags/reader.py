@@ -86,10 +86,10 @@ class BagLog(Log):
     Attributes:
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
         trajectory: times and `T_world_ego` of all transforms or messages, by which `DeskewedLog` moves points.
-        timestamps: nanoseconds from the header of each cloud. If headers hardly change from one cloud to the next, they
-            are the times of arrival. If a clock was set back, it runs on. If the clocks of clouds and poses surely
-            differ, they are shifted to that of the poses. Each of these is said. Clouds before the first or after the
-            last pose are left out.
+        timestamps: nanoseconds from the header of each cloud; of a header of 0, the time of arrival. If headers hardly
+            change from one cloud to the next, all are times of arrival. If a clock was set back, we add the step to
+            later times. If the clocks of clouds and poses surely differ, times are shifted to that of the poses. Each
+            of these is said. Clouds before the first or after the last pose are left out.
         topic, frame: the settings in use.
 
     Convention: points are in the ego frame, as measured (`open_log` de-skews them). Poses are interpolated at the time
@@ -349,6 +349,7 @@ class BagLog(Log):
     def _timed(self, stamps: list[tuple[int, int]]) -> dict[int, tuple[int, int]]:
         """Return the arrival of each cloud by its time, and by how much the time differs from the stamp.
 
+        If a stamp is 0, the arrival takes its place.
         Stamps that hardly grow from one arrival to the next are replaced by the arrivals. If they fall, and the delays
         grow at once, a clock was set back, and we let it run on. A note says what was done.
 
@@ -359,10 +360,10 @@ class BagLog(Log):
         if sum(is_same) > max(len(stamps) // 2 - 1, 0):
             count = len(stamps) - sum(is_same)
             self._note(f"its {len(stamps)} clouds have {count} different time stamps, so we use their times of arrival")
-            return {arrived: (arrived, arrived - stamp) for stamp, arrived in stamps}
+            return {arrived: (arrived, arrived - (stamp or arrived)) for stamp, arrived in stamps}
         arrival: dict[int, int] = {}
         for stamp, arrived in stamps:
-            arrival.setdefault(stamp, arrived)  # clouds that are played twice repeat their stamps
+            arrival.setdefault(stamp or arrived, arrived)  # clouds that are played twice repeat their stamps
         first = list(arrival.items())
         if len(first) < len(stamps):
             count = len(stamps) - len(first)
@@ -430,7 +431,7 @@ class BagLog(Log):
             clouds = [connection for connection in reader.connections if connection.topic == self.topic]
             for connection, _, data in reader.messages(clouds, start=arrived, stop=arrived + 1):
                 message = reader.deserialize(data, connection.msgtype)
-                if _stamp(message) + shift == time and _frame_of(message) == self._lidar:
+                if (_stamp(message) or arrived) + shift == time and _frame_of(message) == self._lidar:
                     return cloud_columns(message)
             raise CFlowError("the cloud is gone; was the bag changed?")
 
