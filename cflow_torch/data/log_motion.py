@@ -107,6 +107,11 @@ def _motions(poses: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.nda
     return np.linalg.inv(poses[second]) @ poses[first]  # type: ignore[no-any-return]
 
 
+def _motion(poses: np.ndarray, first: int, second: int) -> np.ndarray:
+    """Return the motion from one sweep to another one, (4, 4)."""
+    return _motions(poses, np.array([first]), np.array([second]))[0]  # type: ignore[no-any-return]
+
+
 def _speeds(poses: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the metres that the vehicle moves in a sweep interval of each pair, (n,)."""
     return np.linalg.norm(poses[second, :3, 3] - poses[first, :3, 3], axis=1) / (second - first)  # type: ignore[no-any-return]
@@ -169,11 +174,15 @@ def _hardly_move(poses: np.ndarray) -> bool:
 def fits_better(log: Log, others: np.ndarray) -> bool:
     """Test whether the points of a log fit other poses, (K, 4, 4) float64, clearly better than its own."""
     poses = known_poses(log)
+    if poses is None:
+        return False
+    steps = steps_of(log)
+    chosen = _pairs_without_repeats(log, poses, () if steps is None else steps.suspects, ())
     prepared = []
-    for first, second in [] if poses is None else choose_pairs(len(log.timestamps), poses):
+    for first, second in chosen:
         pair = make_pair(log.sweep(first), log.sweep(second), in_world=False)
-        given, other = (np.linalg.inv(each[second]) @ each[first] for each in (np.asarray(poses), others))
-        prepared.append(pair and replace(pair, transforms={GIVEN: given, _OTHER: other}))
+        transforms = {GIVEN: _motion(poses, first, second), _OTHER: _motion(others, first, second)}
+        prepared.append(pair and replace(pair, transforms=transforms))
     return _OTHER in judge(prepared).best
 
 
@@ -219,7 +228,7 @@ def _make_pairs(
         around = None if extended is None else extended[start + num_before : second + num_before + _REACH + 1]
         speed = 0.0
         if poses is not None:
-            motion = np.linalg.inv(poses[second]) @ poses[first]
+            motion = _motion(poses, first, second)
             speed = float(difference(motion, np.eye(4))) / (second - first)
         least = {OFF: _LEAST_TIMED, TIMES: _LEAST_TIMED}
         shown = [scan for scan in scans if scan == scans[0] or speed >= least.get(scan, _LEAST_SPEED)]
