@@ -12,7 +12,8 @@ from torch.utils.data import Dataset
 
 from cflow_torch.data.camera import Camera
 from cflow_torch.data.finding import Finding
-from cflow_torch.diagnosis.readings import LEAST_DISTANCE, Judgement, is_around
+from cflow_torch.diagnosis.pair import LEAST_DISTANCE, is_around
+from cflow_torch.diagnosis.readings import Judgement
 from cflow_torch.errors import MissingFile, warn
 from cflow_torch.transforms import poses_at
 from cflow_torch.types import CFlowError, Sweep, Window, as_numpy, check_array

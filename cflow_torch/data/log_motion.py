@@ -11,16 +11,9 @@ import numpy as np
 from cflow_torch.data.log import Log, known_poses, poses_beyond
 from cflow_torch.diagnosis.conventions import MARGIN, OFF, STILL, TIMES, WORLD
 from cflow_torch.diagnosis.inspection import repeats
-from cflow_torch.diagnosis.readings import (
-    GIVEN,
-    LEAST_SHARE,
-    UNKNOWN,
-    Judgement,
-    Pair,
-    difference,
-    judge,
-    make_pair,
-)
+from cflow_torch.diagnosis.pair import GIVEN, Pair, difference, make_pair
+from cflow_torch.diagnosis.readings import UNKNOWN, Judgement, judge
+from cflow_torch.diagnosis.stillness import LEAST_SHARE
 from cflow_torch.transforms import turn_of
 
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair

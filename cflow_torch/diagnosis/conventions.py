@@ -21,6 +21,7 @@ OFF, TIMES = "off", "times"  # scans: the points stay, or move by their times
 STILL, WORLD, INVERTED, REVERSED = "still", "world", "inverted", "reversed"
 CAMERA, MOUNT = "camera", "mount"
 MARGIN = 1.3  # share in place over that as given, from which a reading is clearly better
+EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
 _SMALL = 1.1  # the same of small mistakes, which make a small difference
 # Vehicles of the same speed stand still without the ego motion: up to 1.56. Mirrored axes change little on a straight
 # road: up to 0.99 for right poses.

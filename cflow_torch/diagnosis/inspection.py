@@ -9,8 +9,9 @@ import torch
 
 from cflow_torch.config import Config
 from cflow_torch.diagnosis.conventions import INVERTED, STILL, WORLD
+from cflow_torch.diagnosis.pair import make_pair
 from cflow_torch.diagnosis.point_frame import frame_problem
-from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, judge, make_pair
+from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, judge
 from cflow_torch.diagnosis.stillness import LEAST_SHARE, MISPLACED, are_finite, share_of_sweeps
 from cflow_torch.errors import warn
 from cflow_torch.ground.segmentation import find_ground, has_ground

@@ -22,7 +22,9 @@ from cflow_torch.data.log_check import FOUND, RIGHT, WRONG, check_log, examine, 
 from cflow_torch.data.log_motion import JUMP, POSE, find_lapses, judge_log
 from cflow_torch.data.read_as import read_as
 from cflow_torch.diagnosis.conventions import AXES, CAMERA, UNITS, WORLD
-from cflow_torch.diagnosis.readings import GIVEN, NO_READING, UNKNOWN, _compare, _mounting
+from cflow_torch.diagnosis.other_frame import mounting
+from cflow_torch.diagnosis.pair import GIVEN
+from cflow_torch.diagnosis.readings import NO_READING, UNKNOWN, _compare
 from cflow_torch.errors import MissingFile
 from cflow_torch.simulator import make_drive
 from cflow_torch.transforms import (
@@ -221,7 +223,7 @@ def test_a_small_tilt_is_told_as_a_turn_of_that_size(drive):
     """As 0 degrees about z, it would be no help."""
     wrong = Wrong(drive, poses=each(lambda pose: pose @ as_matrix(rotations_about(1, np.radians(9.5)))))
     assert any("turned by about 10 degrees" in text for text in find_problems(wrong))
-    tilted = _mounting(rotations_about(1, np.radians(4)), np.zeros(3))
+    tilted = mounting(rotations_about(1, np.radians(4)), np.zeros(3))
     assert "turned by about 4 degrees" in tilted.cause
 
 
