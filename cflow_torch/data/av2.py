@@ -132,10 +132,7 @@ class AV2Log(BoxLog):
         """Return the poses of the sweeps, (K, 4, 4), and leave out sweeps that have none."""
         poses, is_known, note = fit_to_sweeps(trajectory, self.timestamps)
         self._note(note)
-        kept = np.flatnonzero(is_known)
-        self.timestamps = [self.timestamps[k] for k in kept]
-        self.gaps |= frozenset(np.flatnonzero(np.diff(kept) > 1).tolist())
-        self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
+        self._keep(is_known, f"{self.folder}: without the sweeps that have no pose, it")
         return poses
 
     def sweep(self, index: int) -> Sweep:

@@ -263,6 +263,17 @@ class Log(ABC):
             raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self) - 1}, you asked for {index}")
         return self.timestamps[index]
 
+    def _keep(self, is_kept: np.ndarray, where: Any) -> np.ndarray:
+        """Leave out sweeps, (K,) bool, with gaps in their places, and return the indices of the others.
+
+        `where` as in `_check_count`.
+        """
+        kept = np.flatnonzero(is_kept)
+        self.timestamps = [self.timestamps[k] for k in kept]
+        self.gaps |= frozenset(np.flatnonzero(np.diff(kept) > 1).tolist())
+        self._check_count(where)
+        return kept
+
     def _check_count(self, where: Any) -> None:
         """Refuse a log without a pair of sweeps; `where` begins the message."""
         if len(self.timestamps) < 2:

@@ -12,11 +12,11 @@ from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_po
 from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, judge_log
 from cflow_torch.data.neighbours import Neighbours, middle_sweeps
 from cflow_torch.data.read_as import ReadAs, begins_late
-from cflow_torch.diagnosis.conventions import EQUAL, READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
+from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
 from cflow_torch.diagnosis.inspection import mask_problem, repeats
 from cflow_torch.diagnosis.pair import difference
 from cflow_torch.diagnosis.point_frame import frame_problem
-from cflow_torch.diagnosis.readings import HALVES, INACCURATE, NO_READING, UNKNOWN, Judgement
+from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, Judgement
 from cflow_torch.diagnosis.stillness import IN_PLACE, LEAST_SHARE, Structure, are_finite, share_of_sweeps
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.transforms import relative_transform, transform_points
@@ -58,7 +58,6 @@ _TWO_SENSORS = Finding(
 )
 _OF_SPARSE_POSES = "its poses are interpolated over several sweeps, which data.odometry=refine corrects"
 _UNITS_OF_POINTS = [f"points_{unit}" for unit in UNITS]
-_NUM_SWEEPS = {name: 0.5 if name in HALVES else int(name.partition("_")[2] or 1) for name in TIMES_OF_POSES}
 
 
 class _CheckedLog(CachedLog):
@@ -227,28 +226,9 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
         why = "the static world moves under the poses:" if name != WORLD else ""
         fix = " or ".join(judgement.reading(each).fix or _setting(log, each) for each in judgement.best)
         fix = f"give {fix}" + (", or pass no poses" if name == STILL else "")
-        shifts = _shifts_of_clocks(log, judgement)
-        if shifts:
-            why += f" the clocks of sweeps and poses may differ by {_span(shifts.values())} s, because"
-        if len(shifts) > 1:
-            fix = f"correct the times of one, or try data.read_as={_span(shifts)}"
+        if name in TIMES_OF_POSES and log.trajectory is not None:
+            why += " the clocks of sweeps and poses may differ, because"
     return [Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)]
-
-
-def _shifts_of_clocks(log: Log, judgement: Judgement) -> dict[str, str]:
-    """Return what poses of another time mean if they have times: the readings that fit as well, and their seconds."""
-    best, interval = judgement.best[0], intervals_of(log)
-    if best not in TIMES_OF_POSES or log.trajectory is None or interval is None:
-        return {}
-    least = EQUAL * judgement.shares[best]
-    kind = best.partition("_")[0]
-    equal = [name for name, share in judgement.shares.items() if name.startswith(kind) and share >= least]
-    return {name: f"{_NUM_SWEEPS[name] * float(np.median(interval)):.2g}" for name in equal}
-
-
-def _span(names: Iterable[str]) -> str:
-    first, *others = names
-    return " to ".join([first, *others[-1:]])
 
 
 def _setting(log: Log, reading: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Callable, Collection, Iterator, NamedTuple, Sequence
+from typing import Any, Callable, Collection, Iterator, NamedTuple, Sequence
 
 import numpy as np
 
@@ -70,7 +70,8 @@ def choose_pairs(
     rows = _preferred(rows, ~(np.isin(first - 1, jumps) | np.isin(second, jumps)))
     first, second = first[rows], second[rows]
     turn = turn_of(_motions(poses, first, second))
-    criteria = [turn, _speeds(poses, first, second)]
+    speed = np.linalg.norm(poses[second, :3, 3] - poses[first, :3, 3], axis=1) / (second - first)
+    criteria = [turn, speed]
     if has_neighbours[rows].any():
         criteria.append(_changes(poses, first, second))
     chosen = {int(criterion.argmax()) for criterion in criteria}  # ties: the first
@@ -95,19 +96,9 @@ def _num_intervals(poses: np.ndarray, jumps: Sequence[int]) -> np.ndarray:
     return is_near.cumprod(1).sum(1).clip(min=1)  # type: ignore[no-any-return]
 
 
-def _motions(poses: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the motions from sweeps to others, (n, 4, 4), of which the indices are given, (n,) each."""
+def _motions(poses: np.ndarray, first: Any, second: Any) -> np.ndarray:
+    """Return the motions from sweeps to others, (..., 4, 4), of which the indices are given, (...)."""
     return np.linalg.inv(poses[second]) @ poses[first]  # type: ignore[no-any-return]
-
-
-def _motion(poses: np.ndarray, first: int, second: int) -> np.ndarray:
-    """Return the motion from one sweep to another one, (4, 4)."""
-    return _motions(poses, np.array([first]), np.array([second]))[0]  # type: ignore[no-any-return]
-
-
-def _speeds(poses: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the metres that the vehicle moves in a sweep interval of each pair, (n,)."""
-    return np.linalg.norm(poses[second, :3, 3] - poses[first, :3, 3], axis=1) / (second - first)  # type: ignore[no-any-return]
 
 
 def _changes(poses: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -174,7 +165,7 @@ def fits_better(log: Log, others: np.ndarray) -> bool:
     prepared = []
     for first, second in chosen:
         pair = make_pair(log.sweep(first), log.sweep(second), in_world=False)
-        transforms = {GIVEN: _motion(poses, first, second), _OTHER: _motion(others, first, second)}
+        transforms = {GIVEN: _motions(poses, first, second), _OTHER: _motions(others, first, second)}
         prepared.append(pair and replace(pair, transforms=transforms))
     return _OTHER in judge(prepared).best
 
@@ -221,7 +212,7 @@ def _make_pairs(
         around = None if extended is None else extended[start + num_before : second + num_before + _REACH + 1]
         speed = 0.0
         if poses is not None:
-            motion = _motion(poses, first, second)
+            motion = _motions(poses, first, second)
             speed = float(difference(motion, np.eye(4))) / (second - first)
         least = {OFF: _LEAST_TIMED, TIMES: _LEAST_TIMED}
         shown = [scan for scan in scans if scan == scans[0] or speed >= least.get(scan, _LEAST_SPEED)]

@@ -72,11 +72,8 @@ class PandaSetLog(Log):
         lidar = self.folder / "lidar"
         named = {end: sorted(path for path in visible(lidar) if path.name.endswith(end)) for end in (".pkl.gz", ".pkl")}
         self._files = named[".pkl.gz"] or named[".pkl"]
-        times, poses = lidar / "timestamps.json", lidar / "poses.json"
-        with file_errors(times):
-            self.timestamps = [round(float(seconds) * 1e9) for seconds in read_json(times)]
-        with file_errors(poses):
-            self._poses = poses_from_json(read_json(poses), "position", "heading", f"{poses}: pose")
+        seconds, self._poses = _times_and_poses(lidar)
+        self.timestamps = [round(each * 1e9) for each in seconds]
         self._check_count(self.folder)
         if not len(self._files) == len(self._poses) == len(self.timestamps):
             counts = f"{len(self._files)} sweeps, {len(self._poses)} poses and {len(self.timestamps)} time stamps"
@@ -150,12 +147,7 @@ class PandaSetLog(Log):
             with file_errors(file):
                 numbers = read_json(file)
                 matrix = intrinsic_matrix(*(float(numbers[name]) for name in ("fx", "fy", "cx", "cy")))
-            file = file.with_name("poses.json")
-            with file_errors(file):
-                poses = poses_from_json(read_json(file), "position", "heading", f"{file}: pose")
-            file = file.with_name("timestamps.json")
-            with file_errors(file):
-                times = [float(seconds) for seconds in read_json(file)]
+            times, poses = _times_and_poses(file.parent)
             if not len(poses) == len(times) == len(self._files):
                 raise CFlowError(
                     f"{file.parent} has {len(poses)} poses and {len(times)} times of images for {len(self._files)} "
@@ -199,6 +191,15 @@ class PandaSetLog(Log):
                 np.stack([cuboids[name][rows] for name in _SIZE], axis=1),
                 np.linalg.inv(self._poses[index]) @ world,
             )
+
+
+def _times_and_poses(folder: Path) -> tuple[list[float], np.ndarray]:
+    """Read the K unix times in seconds, and the poses, (K, 4, 4) float64, of a LiDAR or a camera."""
+    times, poses = folder / "timestamps.json", folder / "poses.json"
+    with file_errors(times):
+        seconds = [float(each) for each in read_json(times)]
+    with file_errors(poses):
+        return seconds, poses_from_json(read_json(poses), "position", "heading", f"{poses}: pose")
 
 
 def _columns(file: Path, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:

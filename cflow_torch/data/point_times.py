@@ -7,7 +7,6 @@ from typing import Any, Callable, Mapping, NamedTuple
 import numpy as np
 
 from cflow_torch.data.column_names import time_columns
-from cflow_torch.windows.returns import missing_returns
 
 _UNITS = (10**9, 10**6, 10**3, 1)  # nanoseconds in s, ms, us and ns
 # Seconds in which the middle half of the points is measured. The range is below a factor of 1000, so one unit fits.
@@ -15,7 +14,6 @@ _SHORTEST_HALF, _LONGEST_HALF = 0.0015, 1.4
 _USUAL_PERIOD, _LONGEST_PERIOD = 0.1, 0.25  # seconds between sweeps; a log with more is thinned
 _LARGEST_LAG = 1.0  # seconds from the stamp of a sweep to its points; more means another clock
 _REPEATED = 0.01  # a single time of more points than this share is a default value, if no other time has many points
-_PARTS, _FEWEST_TURNS = 50, 0.1  # parts of a sweep in which we measure its rotation; a LiDAR that rotates less does not
 _COARSE = 8  # steps of a float in that half; with fewer, the type cannot hold the times
 
 
@@ -32,14 +30,13 @@ def find_times(
     columns: Mapping[str, np.ndarray],
     stamp_ns: int | None,
     period: float | None,
-    points: np.ndarray | None,
     tell: Callable[[str, str], None],
 ) -> PointTimes | None:
     """Return the times in the columns of a cloud, by the first usable one; None = there are none.
 
     `tell` is called with what we assume or leave out, and the kind of this text. Other arguments: `seconds_after`.
     """
-    found = [seconds_after(columns[name], stamp_ns, period, points) for name in time_columns(columns)]
+    found = [seconds_after(columns[name], stamp_ns, period) for name in time_columns(columns)]
     usable = [times for times in found if times.seconds is not None]
     for times in usable[:1] or found:
         tell(times.note, "times of points")
@@ -52,16 +49,13 @@ def find_times(
     return usable[0]
 
 
-def seconds_after(
-    values: np.ndarray, stamp_ns: int | None, period: float | None = None, points: np.ndarray | None = None
-) -> PointTimes:
+def seconds_after(values: np.ndarray, stamp_ns: int | None, period: float | None = None) -> PointTimes:
     """Convert times of any unit and clock to seconds after the stamp of their sweep.
 
     Args:
         values: (N,) integers or floats.
         stamp_ns: time of the sweep, nanoseconds; None = unknown.
         period: seconds between the sweeps of the log; None = unknown.
-        points: (N, 2+) in the frame of the LiDAR, which tell how far it turned in a sweep; None = once.
 
     Convention:
         - Integers that wrapped go on: we take differences from the median modulo the range of their type.
@@ -82,8 +76,7 @@ def seconds_after(
     early, late = np.quantile(ticks[~is_stray], (0.25, 0.75))
     half = float(late - early)
     if _is_share(known):
-        revolution = period if period is not None and period <= _LONGEST_PERIOD else _USUAL_PERIOD
-        duration = revolution * (1.0 if points is None else _turns(values[~is_stray], points[~is_stray]))
+        duration = period if period is not None and period <= _LONGEST_PERIOD else _USUAL_PERIOD
         note = f"times of points go from 0 to 1, so we take them for shares of a sweep of {duration:.3g} s"
         return PointTimes(np.where(is_stray, 0.0, values) * duration, is_stray, note)
     if values.dtype.kind == "f" and abs(centre) > 1 and half < _COARSE * np.spacing(abs(centre)):
@@ -126,17 +119,6 @@ def _differences(values: np.ndarray, centre: Any) -> np.ndarray:
 
 def _is_share(known: np.ndarray) -> bool:
     return known.dtype.kind == "f" and 0 <= known.min() <= 0.1 and 0.9 <= known.max() <= 1
-
-
-def _turns(shares: np.ndarray, points: np.ndarray) -> float:
-    """Return the turns, at most 1, of a LiDAR that measures points at shares of a sweep; 1 if it does not rotate."""
-    is_return = ~missing_returns(points)
-    part = (shares[is_return] * _PARTS).astype(np.int64).clip(0, _PARTS - 1)
-    angle = np.arctan2(points[is_return, 1], points[is_return, 0])
-    sines, cosines = (np.bincount(part, f(angle), _PARTS) for f in (np.sin, np.cos))
-    steps = np.diff(np.unwrap(np.arctan2(sines, cosines)))
-    turns = abs(float(np.median(steps))) * _PARTS / (2 * np.pi)
-    return min(turns, 1.0) if turns > _FEWEST_TURNS else 1.0
 
 
 def _lag(centre: Any, unit: int, stamp_ns: int) -> int:

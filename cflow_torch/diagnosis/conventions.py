@@ -130,12 +130,12 @@ def _later(by: float) -> _Convert:
         if abs(by) < 1:
             return halfway(poses, _later(np.sign(by))(poses))
         rows = np.arange(len(poses)) + int(by)
-        moved = poses[rows.clip(0, len(poses) - 1)]
-        for row in np.flatnonzero((rows < 0) | (rows >= len(poses))):
-            end, before = (0, 1) if by < 0 else (-1, -2)
-            step = np.linalg.inv(poses[before]) @ poses[end]
-            beyond = -rows[row] if by < 0 else rows[row] - len(poses) + 1
-            moved[row] = poses[end] @ np.linalg.matrix_power(step, int(beyond))
+        inside = rows.clip(0, len(poses) - 1)
+        before = 0 if by < 0 else -2  # the step at the end beyond which the motion continues
+        step = np.linalg.inv(poses[before]) @ poses[before + 1]
+        moved = poses[inside]
+        for row in np.flatnonzero(rows != inside):
+            moved[row] = moved[row] @ np.linalg.matrix_power(step, int(rows[row] - inside[row]))
         return moved
 
     return convert
@@ -214,6 +214,7 @@ READINGS: dict[str, Reading] = {
         "the angles of the poses are compass headings (clockwise from north)", _transposed(AXES["left"])
     ),
     "degrees": Reading("the angles of the poses are degrees, but were read as radians", _of_angles(np.radians)),
+    "radians": Reading("the angles of the poses are radians, but were read as degrees", _of_angles(np.degrees)),
     "yaw_first": Reading(
         "the angles of the poses are yaw, pitch, roll, but were read as roll, pitch, yaw",
         _of_angles(lambda angles: angles[::-1]),

@@ -316,6 +316,17 @@ def test_sensors_may_differ_by_a_digit(tmp_path, names):
     assert len(ArraysLog(tmp_path, suffix=names[1].split("_")[0] + "_*.npy")) == 3
 
 
+def test_some_clouds_of_a_folder_may_be_compressed(tmp_path):
+    for number in range(3):
+        np.save(tmp_path / f"{number}.npy", np.full((4, 3), number + 1.0))
+    (tmp_path / "1.npy.gz").write_bytes(gzip.compress((tmp_path / "1.npy").read_bytes()))
+    with pytest.raises(CFlowError, match="has several files of one name"):
+        ArraysLog(tmp_path)
+    (tmp_path / "1.npy").unlink()
+    for suffix in (None, "npy", ".npy.gz"):
+        assert [sweep.points[0, 0] for sweep in ArraysLog(tmp_path, suffix=suffix)] == [1, 2, 3]
+
+
 def test_numbers_that_count_tell_no_sensors(tmp_path):
     for name in ("drive1_a", "20240105T12_00", "20240105T13_00", "scan1", "scan10_x2"):
         (tmp_path / name).mkdir()

@@ -401,6 +401,18 @@ def test_the_frame_of_a_lidar_that_carries_base_link_is_not_that_of_the_world(tm
     assert not [each for each in recwarn if "frame of the world" in str(each.message)]
 
 
+def test_a_base_link_of_another_robot_is_not_the_vehicle(tmp_path) -> None:
+    bag = Recorder(tmp_path)
+    bag.transform(bag.stamps[0], "robot1/body", "velodyne", MOUNT)
+    for stamp in range(bag.stamps[0] - 10**8, bag.stamps[-1] + 10**8, STEP):
+        pose = bag.recording.pose_at(stamp)
+        bag.transform(stamp, "map", "robot1/body", pose)
+        bag.transform(stamp, "map", "robot2/base_link", as_matrix(np.eye(3), -2 * pose[:3, 3]))
+    bag.clouds()
+    log = BagLog(bag.close())
+    assert log.frame == "robot1/body" and world(log, bag.recording) < 5e-3
+
+
 LIVOX = {
     "CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line",
     "CustomMsg": "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"

@@ -25,7 +25,7 @@ def street(columns: int, kind: str = "<f4", count: int = 2400, shuffled: bool = 
 
 
 @pytest.mark.parametrize("shuffled", [False, True])
-@pytest.mark.parametrize("kind", ["<f4", "<f8", ">f4", ">f8"])
+@pytest.mark.parametrize("kind", ["<f4", "<f8"])
 @pytest.mark.parametrize("columns", [3, 4, 5, 6, 8])
 def test_the_layout_is_recognised(tmp_path, columns: int, kind: str, shuffled: bool) -> None:
     table = street(columns, kind, shuffled=shuffled)

@@ -44,19 +44,6 @@ def test_the_unit_and_origin_of_times_are_recognised(values: Any, first: float, 
     assert (times.note == "") == (not is_assumed)
 
 
-@pytest.mark.parametrize("turn", [-2 * np.pi, 2 * np.pi, 4.0])
-def test_shares_of_a_sweep_last_as_long_as_the_lidar_turns(turn: float) -> None:
-    angle = 1.0 + SHARES * turn
-    points = np.stack([np.cos(angle), np.sin(angle)], 1) * 10
-    seconds = seconds_after(SHARES, STAMP, 0.1, points).seconds
-    assert np.allclose(seconds, SHARES * 0.1 * abs(turn) / (2 * np.pi), rtol=0.03)
-    points[::7] = np.nan
-    points[1::7] = 0
-    seconds = seconds_after(SHARES, STAMP, 0.1, points).seconds
-    assert np.allclose(seconds, SHARES * 0.1 * abs(turn) / (2 * np.pi), rtol=0.03), "missing returns"
-    assert np.allclose(seconds_after(SHARES, STAMP, 0.1, points[::-1] * 0 + [9, 1]).seconds, SHARES * 0.1)
-
-
 def test_columns_of_times_are_found_by_name() -> None:
     names = "t time timestamp stamps GpsTime dt delta_t offset offset_ns time_offset_ns point_time_offset t_offset t_us"
     found = [*names.split(), "time_nsec", "timestamp_nsec", "offset_time", "time [s]", "timestamp_unix"]

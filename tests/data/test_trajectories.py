@@ -22,6 +22,7 @@ from cflow_torch.data.catalog import open_log
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
+from cflow_torch.diagnosis.conventions import READINGS
 from cflow_torch.simulator import make_drive
 from cflow_torch.transforms import as_matrix, rotations_about, to_quaternions
 from cflow_torch.types import CFlowWarning, Sweep
@@ -281,26 +282,14 @@ def test_a_plane_pose_and_a_pose_without_a_time(tmp_path) -> None:
     assert np.allclose(untimed.poses[1, :2, 0], (1 - 2 * 0.36, 2 * 0.6 * 0.8))
 
 
-def test_three_numbers_are_a_plane_pose_if_the_vehicle_drives_where_it_heads(tmp_path) -> None:
-    path = tmp_path / "gps.txt"
-    for unit in (1, 180 / np.pi):
-        path.write_text(f"1 2 {0.8 * unit}\n3 4 {0.9 * unit}\n3 4 {0.5 * unit}\n")
-        pose = poses_text.read_poses(path).poses[1]
-        assert np.allclose(pose[:3, 3], (3, 4, 0)) and np.isclose(np.arctan2(pose[1, 0], pose[0, 0]), 0.9)
-    for positions in ("1 2 0.0\n1 5 0.1\n", "3 2 1.7\n1 2 1.8\n", "1 2 0\n1 2 0\n"):
-        path.write_text(positions)
-        with pytest.raises(CFlowError, match="3 numbers per line"):
-            poses_text.read_poses(path)
-
-
-def test_a_yaw_that_is_not_wrapped_has_radians(tmp_path) -> None:
+def test_a_yaw_that_is_not_wrapped_is_undone_by_a_reading(tmp_path) -> None:
     yaw = np.arange(60) * 0.2  # almost two turns
-    way = np.cumsum(np.exp(1j * yaw))
-    for unit in (1.0, 180 / np.pi):
-        lines = rows(np.column_stack([way.real, way.imag, 0 * yaw, 0 * yaw, 0 * yaw, yaw * unit])[:-1])
+    for unit, reading in ((1.0, "radians"), (180 / np.pi, None)):
+        lines = rows(np.column_stack([*np.zeros((5, 60)), yaw * unit]))
         (tmp_path / "poses.txt").write_text("\n".join(lines))
-        turned = poses_text.read_poses(tmp_path / "poses.txt").poses[1:, 0, 0]
-        assert np.allclose(turned, np.cos(yaw[1:-1]), atol=1e-6), unit
+        read = poses_text.read_poses(tmp_path / "poses.txt").poses
+        convert = READINGS[reading].of_poses if reading else np.asarray
+        assert np.allclose(convert(read)[:, 0, 0], np.cos(yaw), atol=1e-6), unit
 
 
 def test_a_number_may_be_in_front_of_tum(tmp_path) -> None:

@@ -17,10 +17,11 @@ from scipy.spatial.transform import Rotation
 from writers.waymo import write_waymo_segment
 
 from cflow_torch.data.catalog import find_sources
-from cflow_torch.data.waymo.range_image import LaserCalibration, range_image_points, rotations_from_angles
+from cflow_torch.data.waymo.range_image import LaserCalibration, range_image_points
 from cflow_torch.data.waymo.reader import LIDAR, TIME, TRACK, VEHICLE_POSE, Component, WaymoLog, matrix_of
 from cflow_torch.simulator.drive import Drive, make_drive
 from cflow_torch.simulator.profiles import PROFILES
+from cflow_torch.transforms import rotations_of
 from cflow_torch.types import CFlowError
 
 
@@ -64,7 +65,7 @@ def test_rows_columns_and_angles_are_those_of_the_format() -> None:
     np.testing.assert_allclose(np.degrees(even.column_azimuths(4)), [135, 45, -45, -135], atol=1e-12)
     angles = np.array([[0.1, -0.2, 3.0], [-3.0, 1.5, -0.7]])
     expected = Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix()
-    np.testing.assert_allclose(rotations_from_angles(angles), expected, atol=1e-15)
+    np.testing.assert_allclose(rotations_of(angles.T), expected, atol=1e-15)
 
 
 def test_world_coordinates_of_kilometres_keep_millimetres() -> None:

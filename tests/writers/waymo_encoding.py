@@ -7,15 +7,10 @@ from typing import Any, Callable
 
 import numpy as np
 
-from cflow_torch.data.waymo.range_image import (
-    INTENSITY,
-    RANGE,
-    LaserCalibration,
-    directions,
-    rotations_from_angles,
-)
+from cflow_torch.data.waymo.range_image import INTENSITY, RANGE, LaserCalibration, directions
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.recording import UnitReturns
+from cflow_torch.transforms import rotations_of
 from cflow_torch.types import CFlowError
 
 _NODES = 4  # sweeps whose poses we interpolate by a cubic, which is exact for constant jerk
@@ -42,13 +37,13 @@ class ShotPoses:
     def to_shot(self, points: np.ndarray, T_ego_sensor: np.ndarray) -> np.ndarray:
         """Transform points (N, 3) from the laser's frame at the pose of the frame to its frame at their shot."""
         world = self._world(points, T_ego_sensor)
-        ego = np.einsum("nji,nj->ni", rotations_from_angles(self.of_shot[:, :3]), world - self.of_shot[:, 3:])
+        ego = np.einsum("nji,nj->ni", rotations_of(self.of_shot[:, :3].T), world - self.of_shot[:, 3:])
         return (ego - T_ego_sensor[:3, 3]) @ T_ego_sensor[:3, :3]
 
     def shifted_to(self, points: np.ndarray, on_rays: np.ndarray, T_ego_sensor: np.ndarray) -> np.ndarray:
         """(N, 6) poses of the shots, shifted so that they map `on_rays` (N, 3) to the true points (N, 3)."""
         ego = on_rays @ T_ego_sensor[:3, :3].T + T_ego_sensor[:3, 3]
-        rotated = np.einsum("nij,nj->ni", rotations_from_angles(self.of_shot[:, :3]), ego)
+        rotated = np.einsum("nij,nj->ni", rotations_of(self.of_shot[:, :3].T), ego)
         return np.concatenate([self.of_shot[:, :3], self._world(points, T_ego_sensor) - rotated], axis=1)
 
     def _world(self, points: np.ndarray, T_ego_sensor: np.ndarray) -> np.ndarray:

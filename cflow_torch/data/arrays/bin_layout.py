@@ -46,9 +46,8 @@ class BinLayout(NamedTuple):
         return len(content) < _FEWEST * self.step or _explained(_numbers(start, self.kind), self.columns) >= _EXPLAINED
 
     def __str__(self) -> str:
-        order = "big-endian " if self.kind[0] == ">" else ""
         rest = f" and {self.rest} other bytes" if self.rest else ""
-        return f"{self.columns} {order}float{8 * np.dtype(self.kind).itemsize}{rest} per point"
+        return f"{self.columns} float{8 * np.dtype(self.kind).itemsize}{rest} per point"
 
 
 def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
@@ -58,11 +57,11 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
         content: the whole file.
         columns: numbers per point; None = find out. Then only x, y and z tell the type: a time may have any size.
 
-    Convention: the type is the one, float32 or float64, little- or big-endian, in which numbers have sizes of
-        coordinates. Columns differ in size (z is smaller than x and y, intensities are larger). We choose the number of
-        columns, 3 to 8, that explains most of the variance of log sizes. Ties: the smallest. A file that is empty or
-        too short to tell is KITTI's. If no type fits, points may be records of several types that begin with x, y, z
-        in float32 (ring and time after them are integers or float64): the fewest bytes in which they do.
+    Convention: the type is the one, float32 or float64, in which numbers have sizes of coordinates. Columns differ in
+        size (z is smaller than x and y, intensities are larger). We choose the number of columns, 3 to 8, that explains
+        most of the variance of log sizes. Ties: the smallest. A file that is empty or too short to tell is KITTI's. If
+        no type fits, points may be records of several types that begin with x, y, z in float32 (ring and time after
+        them are integers or float64): the fewest bytes in which they do.
 
     Raises:
         CFlowError: no layout fits. The message names `bin_columns`.
@@ -98,33 +97,26 @@ def _are_records(content: bytes, layout: BinLayout) -> bool:
         return False
     with np.errstate(invalid="ignore"):  # numbers of another type may be signalling NaN
         points = layout.table(content[: _FEWEST * layout.step]).astype(np.float64)
-    size = np.abs(points)
-    is_usual = ((size > _SMALLEST) & (size < _FARTHEST)) | (size == 0) | ~np.isfinite(size)
     # Columns of one number are padding or counters, read as floats.
-    return bool(is_usual.mean() >= _SHARE) and all(len(np.unique(column)) > _FEWEST // 4 for column in points.T)
+    have_values = all(len(np.unique(column)) > _FEWEST // 4 for column in points.T)
+    return have_values and are_plausible(points, _FARTHEST)
 
 
 def _type_of(content: bytes, columns: int | None) -> str:
-    """Return the type of the numbers, "<f4", "<f8", ">f4" or ">f8"; "" = they fit none."""
-    return _type_in(content, "<", columns) or _type_in(content, ">", columns)
-
-
-def _type_in(content: bytes, order: str, columns: int | None) -> str:
-    """Return the type of numbers of an order of bytes. float32 can look like float64, but not the reverse."""
-    is_float32, is_float64 = (are_plausible(_numbers(content, order + kind, columns)) for kind in ("f4", "f8"))
+    """Return the type of the numbers, "<f4" or "<f8"; "" = neither. float32 can look like float64, but not reverse."""
+    is_float32, is_float64 = (are_plausible(_numbers(content, kind, columns)) for kind in ("<f4", "<f8"))
     if not is_float32:
-        return f"{order}f8" if is_float64 else ""
+        return "<f8" if is_float64 else ""
     # The lower halves of float64 numbers with few digits are zeros, so they look like float32, too.
-    halves = _numbers(content, f"{order}f4")
-    shares = [float((half == 0).mean()) if len(half) else 0.0 for half in (halves[::2], halves[1::2])]
-    low, high = shares if order == "<" else shares[::-1]
-    return f"{order}f8" if is_float64 and low > 0.5 > high else f"{order}f4"
+    is_zero = _numbers(content, "<f4") == 0
+    has_halves = len(is_zero) > 1 and is_zero[::2].mean() > 0.5 > is_zero[1::2].mean()
+    return "<f8" if is_float64 and has_halves else "<f4"
 
 
-def are_plausible(numbers: np.ndarray) -> bool:
+def are_plausible(numbers: np.ndarray, largest: float = _LARGEST) -> bool:
     """Test whether floats, of any shape, are in a type and byte order that fits: nearly all have usual sizes."""
     size = np.abs(numbers)
-    is_usual = (size == 0) | ~np.isfinite(size) | ((size > _SMALLEST) & (size < _LARGEST))
+    is_usual = (size == 0) | ~np.isfinite(size) | ((size > _SMALLEST) & (size < largest))
     return bool(is_usual.sum() >= _SHARE * is_usual.size)
 
 

@@ -129,7 +129,7 @@ def _alike(files: Sequence[Path]) -> _Kinds:
     numbers of one range.
     """
     kinds: _Kinds = {}
-    for suffix, same in _grouped(files, lambda path: path.name[len(stem_of(path)) :].lower()).items():
+    for suffix, same in _grouped(files, suffix_of).items():
         patterns = _grouped(same, _pattern)
         numbers = [{tuple(_COUNTERS.findall(stem_of(path))) for path in each} for each in patterns.values()]
         fewest = min(map(len, numbers))
@@ -189,7 +189,8 @@ def find_clouds(folder: Path, suffix: str | None) -> list[Path]:
     """
     parent, kinds = next(iter(_places(folder)), (folder, {}))
     if suffix is not None:
-        kinds = {kind: files for kind, files in kinds.items() if kind in (suffix, "." + suffix.lower().lstrip("."))}
+        names = (suffix, suffix_of(Path(f"cloud.{suffix.lstrip('.')}")))
+        kinds = {kind: files for kind, files in kinds.items() if kind in names}
     if not kinds:
         raise CFlowError(
             f"{folder} and its subfolders {', '.join(POINT_FOLDERS)} have fewer than two point clouds "
@@ -198,6 +199,9 @@ def find_clouds(folder: Path, suffix: str | None) -> list[Path]:
     if len(kinds) > 1:
         raise CFlowError(f"{parent} has several kinds of clouds, {', '.join(sorted(kinds))}: choose one by suffix=...")
     files = sorted(next(iter(kinds.values())), key=lambda path: natural_key(stem_of(path)))
+    twice = next((one for one, other in zip(files, files[1:]) if stem_of(one) == stem_of(other)), None)
+    if twice is not None:
+        raise CFlowError(f"{parent} has several files of one name, such as {twice.name}: leave one of each")
     stamps = times_of_names([stem_of(path) for path in files])
     return files if stamps is None else [files[k] for k in np.argsort(stamps, kind="stable")]
 
@@ -241,16 +245,11 @@ def find_pose_files(folder: Path, clouds: Container[Path] = ()) -> list[Path]:
 
     Files that are called as poses (`POSE_FILES`) need no test.
     """
-    poses = [path for path in _tables(folder, clouds) if path.name in POSE_FILES or _have_poses(path)]
+    poses = [path for path in _tables(folder, clouds) if path.name in POSE_FILES or _num_poses(path) > 1]
     for path in sorted(path for path in visible(folder) if path.is_dir() and _holds_no_labels(path)):
         files = files_of_poses(path)
-        poses += [path] if len(files) > 1 and _has_one_pose(files[0]) else []
+        poses += [path] if len(files) > 1 and _num_poses(files[0]) == 1 else []
     return poses
-
-
-def _have_poses(path: Path) -> bool:
-    start = _start_of(path, parse_poses)
-    return start is not None and len(start.poses) > 1
 
 
 def find_poses(
@@ -281,15 +280,15 @@ def find_poses(
     named = only_one(called, folder, "poses")
     if named is not None or kitti.exists():
         return read_poses(named or kitti)
-    own = [path for each in folders for path in find_pose_files(each, frozenset(clouds))]
-    read = read_all(own, read_poses, tell)
+    read = read_all([path for each in folders for path in find_pose_files(each, clouds)], read_poses, tell)
     found = {path: each for path, each in read.items() if fits(each)}
     near = None if found else find_poses_near(folder, top.name, times_ns, fits, tell, clouds)
-    if near is None and not found:
-        found = {path: each for path, each in read.items() if suffix_of(path) in _NEAR_TABLES}
+    if near is not None:
+        return near
+    found = found or {path: each for path, each in read.items() if suffix_of(path) in _NEAR_TABLES}
     file = only_one(_preferred(found, (), times_ns), folder, "poses")
     if file is None:
-        return near
+        return None
     tell(f"its poses are those of {file.name}")
     return found[file]
 
@@ -304,9 +303,25 @@ def find_poses_near(
 ) -> Trajectory | None:
     """Find the file of text near a folder that has the poses of a log: below it, and two levels above it.
 
-    `name` is that of the log. See `find_poses`.
+    `name` is that of the log. Files without unix times, or for sweeps without them, must have the name of the log or
+    one of `_WORDS`, or be in a folder that is called so. Files with the name of a folder next to the log are of that
+    log. See `find_poses`.
     """
-    known, own = ([], []) if is_remote(folder) else _poses_called(folder.resolve(), name, clouds, times_ns)
+    if is_remote(folder):
+        return None
+    top = folder.resolve()
+    others = [path.name for path in visible(top.parent) if path.name not in (top.name, name, *_WORDS) and path.is_dir()]
+    is_unix = times_ns is not None and times_ns[0] >= _FIRST_UNIX
+    own, known = [], []
+    for file, words in _words_near(top).items():
+        is_own = _has_one(file, [name])
+        is_called = is_own or not (_WORDS.isdisjoint(words) or _has_one(file, others))
+        if file in clouds or not (is_unix or is_called):
+            continue
+        start = _start_of(file, parse_poses)
+        if start is not None and (is_called or start.times_ns is not None):
+            known.append(file)
+            own += [file] if is_own else []
     found = {file: each for file, each in read_all(known, read_poses, tell).items() if fits(each)}
     files = _preferred(found, own, times_ns)
     names = " and ".join(found[file].source for file in files)
@@ -317,27 +332,6 @@ def find_poses_near(
     return None
 
 
-def _poses_called(
-    top: Path, name: str, clouds: Container[Path], times_ns: Sequence[int] | None
-) -> tuple[list[Path], list[Path]]:
-    """Return the files near a log that may have its poses, and the files with its name.
-
-    Files without unix times, or for sweeps without them, must have the name of the log or one of `_WORDS`, or be in a
-    folder that is called so. Files with the name of a folder next to the log are of that log.
-    """
-    words = {file: each for file, each in _words_near(top).items() if file not in clouds}
-    others = [path.name for path in visible(top.parent) if path.name not in (top.name, name, *_WORDS) and path.is_dir()]
-    own = [file for file in words if _has_one(file, [name])]
-    called = [file for file in words if not (_WORDS.isdisjoint(words[file]) or _has_one(file, others))]
-    is_unix = times_ns is not None and times_ns[0] >= _FIRST_UNIX
-    texts = [file for file in words if suffix_of(file) in _NEAR_TABLES and (is_unix or file in (*own, *called))]
-    starts = {file: _start_of(file, parse_poses) for file in texts}
-    known = [
-        file for file, start in starts.items() if start and (file in (*own, *called) or start.times_ns is not None)
-    ]
-    return known, own
-
-
 def _has_one(file: Path, names: Sequence[str]) -> bool:
     """Test whether the name of a file contains one of some names, and not as a part of a longer word."""
     either = "|".join(map(re.escape, names))
@@ -345,7 +339,7 @@ def _has_one(file: Path, names: Sequence[str]) -> bool:
 
 
 def _words_near(top: Path) -> dict[Path, list[str]]:
-    """Return the files near a folder, and the words of their names, or that of their folder.
+    """Return the texts near a folder, and the words of their names, or that of their folder.
 
     Of folders next to the log or below it, we look only into those that hold nothing but tables, as others are logs. We
     look at 50 files in each of 50 folders.
@@ -356,25 +350,18 @@ def _words_near(top: Path) -> dict[Path, list[str]]:
         files = sorted(visible(folder))[:_MOST]
         if all(suffix_of(file) in _TABLES for file in files):
             words.update(dict.fromkeys(files, [re.sub("[^a-z]", "", folder.name.lower())]))
-    return words
+    return {file: each for file, each in words.items() if suffix_of(file) in _NEAR_TABLES}
 
 
 def _preferred(found: Mapping[Path, Trajectory], named: Sequence[Path], times_ns: Sequence[int] | None) -> list[Path]:
     """Return the files of poses that are left by the rules of `find_poses`."""
     wanted: Any = [] if times_ns is None else times_ns
-    exact = [
-        path
-        for path, each in found.items()
-        if each.times_ns is not None and _share(wanted, each.times_ns) > _MOST_EXACT
-    ]
+    timed = {path: each.times_ns for path, each in found.items() if each.times_ns is not None}
+    exact = [path for path, known in timed.items() if np.isin(wanted, known).sum() > _MOST_EXACT * len(wanted)]
     files = list(found)
     for better in (named, exact):
         files = [path for path in files if path in better] or files
     return files
-
-
-def _share(times_ns: Sequence[int], known: np.ndarray) -> float:
-    return float(np.isin(times_ns, known).mean()) if len(times_ns) else 0.0
 
 
 def read_all(files: Sequence[Path], read: Callable[[Path], Any], tell: Callable[[str], None]) -> dict[Path, Any]:
@@ -388,12 +375,10 @@ def read_all(files: Sequence[Path], read: Callable[[Path], Any], tell: Callable[
     return found
 
 
-def _has_one_pose(path: Path) -> bool:
-    try:
-        with file_errors(path):
-            return len(read_start(path, _TESTED)) < _TESTED and len(read_poses(path).poses) == 1
-    except CFlowError:
-        return False
+def _num_poses(path: Path) -> int:
+    """Return the number of poses at the start of a file, 0 = it holds none."""
+    start = _start_of(path, parse_poses)
+    return 0 if start is None else len(start.poses)
 
 
 def _start_of(path: Path, parse: Callable[[bytes, Path], Any]) -> Any:

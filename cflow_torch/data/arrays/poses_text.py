@@ -47,8 +47,6 @@ _UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four ar
 STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz", ".npy")
 """Suffixes of files that must be whole to be read, see `tables_of_values`."""
 _IN_ORDER = "write all digits, a line per sweep, in the order of their times"
-_AHEAD = 0.9  # cosine of the angle from the heading to the motion, or the heading is another number
-_LEAST_STEP = 0.1  # metres; shorter steps do not tell where the vehicle heads
 _INVERSE = ("extrinsic", "world2", "world_to", "w2c")  # in names of matrices that map the world to the sensor
 
 
@@ -60,15 +58,13 @@ def read_poses(path: PathLike) -> Trajectory:
             folder with a file per pose. A line of text has 12 numbers (KITTI: upper three rows of the matrix), 8 (TUM:
             time in seconds, tx ty tz, qx qy qz qw, the scalar LAST), 7 (without the time), 16 (the matrix by rows, or
             by columns), 13 or 17 (a time before the matrix), or 9 (the number of the row before TUM). 7 numbers without
-            a quaternion are a time, x y z, roll pitch yaw; 6 have no time. 3 numbers are x y yaw, if the vehicle drives
-            where it heads. Four lines may have a matrix, below a line of three numbers (Open3D). Of a g2o graph,
-            vertices are read. If a line before the numbers names the columns (timestamp, x, qw, ...), they may have any
-            order, and roll, pitch and yaw may replace the quaternion. Other columns, empty lines and comments
-            (`COMMENTS`) are ignored. Times: `nanoseconds_of_numbers`.
+            a quaternion are a time, x y z, roll pitch yaw; 6 have no time. Four lines may have a matrix, below a line
+            of three numbers (Open3D). Of a g2o graph, vertices are read. If a line before the numbers names the columns
+            (timestamp, x, qw, ...), they may have any order, and roll, pitch and yaw may replace the quaternion. Other
+            columns, empty lines and comments (`COMMENTS`) are ignored. Times: `nanoseconds_of_numbers`.
 
     Convention: yaw turns x to y, pitch then z to x, roll then y to z. What is not named of z, roll and pitch is 0. The
-        angles are degrees if their name says so, or one is larger than 2 pi, else radians; but a yaw with which the
-        vehicle drives where it heads only as radians is not wrapped. A quaternion q0 to q3 has w
+        angles are degrees if their name says so, or one is larger than 2 pi, else radians. A quaternion q0 to q3 has w
         first or last, as a vehicle turns mostly about z. Matrices called extrinsic or world to camera are inverted.
     """
     path = as_path(path)
@@ -137,8 +133,6 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
     unnamed = _UNNAMED.get(words.shape[1], ())
     if words.shape[1] in (6, 7) and not names and not _end_in_quaternions(words):
         unnamed = _UNNAMED_ANGLES[7 - words.shape[1] :]
-    if words.shape[1] == 3 and not names and _end_in_headings(words):
-        unnamed = ("x", "y", "yaw")
     if unnamed[:1] == ("row",) and not (np.diff(words[:, 0].astype(np.float64)) == 1).all():
         unnamed = ()  # the first of 9 numbers must count the rows
     if not roles and (not names or len(unnamed) > 9 or len(names) == len(_TUM)):
@@ -177,22 +171,6 @@ def _are_homogeneous(rows: np.ndarray) -> bool:
 def _end_in_quaternions(words: np.ndarray) -> bool:
     norms = np.linalg.norm(words[:, -4:].astype(np.float64), axis=1)
     return bool(np.nanmedian(np.abs(norms - 1)) < 0.1)
-
-
-def _end_in_headings(words: np.ndarray) -> bool:
-    """Tell whether lines of three numbers are x, y, yaw: the vehicle drives where it heads. They may be x, y, z."""
-    numbers = words.astype(np.float64)
-    yaw: np.ndarray = numbers[:, 2]
-    is_large = np.nanmax(np.abs(yaw), initial=0) > 2 * np.pi
-    return _ahead(numbers, np.radians(yaw) if is_large else yaw) > _AHEAD
-
-
-def _ahead(positions: np.ndarray, yaw: np.ndarray) -> float:
-    """Return the median cosine of the angle from the heading, yaw in radians, to the motion; 0 = it stands."""
-    step: np.ndarray = np.diff(positions[:, 0] + 1j * positions[:, 1])
-    moved = np.flatnonzero(np.abs(step) > _LEAST_STEP)
-    ahead = np.real(step[moved] * np.exp(-1j * yaw[moved])) / np.abs(step[moved])
-    return float(np.median(ahead)) if len(moved) else 0.0
 
 
 def _roles(names: Sequence[str]) -> dict[str, int]:
@@ -238,10 +216,7 @@ def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.
             quaternions = quaternions / length[:, None]
         return poses_from_quaternions(positions, quaternions, lambda row: f"{path}: pose {row}")
     angles = np.stack([values.get(name, zeros) for name in _ANGLES])
-    are_degrees = np.abs(angles).max() > 2 * np.pi
-    if are_degrees and _ahead(positions, angles[2]) > _AHEAD:  # a yaw that is not wrapped
-        are_degrees = _ahead(positions, np.radians(angles[2])) > _AHEAD
-    if are_degrees or (names and "deg" in names[roles["yaw"]].lower()):
+    if np.abs(angles).max() > 2 * np.pi or (names and "deg" in names[roles["yaw"]].lower()):
         angles = np.radians(angles)
     return as_matrix(rotations_of(angles), positions)
 

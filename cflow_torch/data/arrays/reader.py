@@ -111,18 +111,16 @@ class ArraysLog(Log):
         self._name_other_folders()
         self._ground = resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         mounting = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
-        stated, file_of_times = self._stated_times(times), None
-        stamps = stated
-        if stated is None and times == "auto":
-            stamps, file_of_times = self._tabled_times()
+        stamps, table = self._known_times(times)
         trajectory, whose = self._trajectory(poses, poses_of, calibration, stamps)
         self.ego_T_lidar = np.eye(4) if whose == "sensor" else mounting
         self.lidar_position = self.ego_T_lidar[:3, 3]
-        counted = None if trajectory is None else trajectory.counted(stated).times_ns
-        if stated is None and counted is not None and len(counted) == len(self.files):
-            stamps = counted.tolist()
-        elif file_of_times is not None:
-            self._note(f"the times of its sweeps are those of {file_of_times.name}")
+        if trajectory is not None and (stamps is None or table is not None):
+            of_poses = trajectory.counted(None).times_ns
+            if of_poses is not None and len(of_poses) == len(self.files):
+                stamps, table = of_poses.tolist(), None
+        if table is not None:
+            self._note(f"the times of its sweeps are those of {table.name}")
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
         self.poses = None if trajectory is None else self._pose_per_sweep(_of_ego(trajectory, whose, mounting), stamps)
@@ -139,7 +137,7 @@ class ArraysLog(Log):
         points, columns = read_table(self.files[index], self._bin_columns)
         time = self.timestamps[index] if self._has_times else None
         period = float(np.median(np.diff(self.timestamps))) * 1e-9 if self._has_times else None
-        times = find_times(columns, time, period, points, self._note)
+        times = find_times(columns, time, period, self._note)
         is_missing = missing_returns(points)
         if times is not None:
             is_missing |= times.is_stray
@@ -257,66 +255,66 @@ class ArraysLog(Log):
         )
         return Trajectory(poses, None, False, _VIEWPOINT)
 
-    def _stated_times(self, times: Any) -> list[int] | None:
-        """Return the nanoseconds of each sweep by times.txt, or by the names of the files; None = unknown."""
-        file = resolve(self.folder, times, ("times.txt",), "times")
-        if file is None:
-            return times_of_names([stem_of(path) for path in self.files])
-        stamps = poses_text.read_times(file)
-        rows = self._rows(len(stamps), what=f"times in {file}")
-        if rows is None:
-            raise CFlowError(f"{file} has {len(stamps)} times for {len(self.files)} sweeps; it needs one each")
-        return stamps[rows].tolist()  # type: ignore[no-any-return]
+    def _known_times(self, times: Any) -> tuple[list[int] | None, Path | None]:
+        """Return the nanoseconds of each sweep by times.txt, else by the names of the files; None = unknown.
 
-    def _tabled_times(self) -> tuple[list[int] | None, Path | None]:
-        """Return the nanoseconds of each sweep in the only other file of so many times, and the file."""
-        read = read_all(find_times_files(self.folder, self.files), poses_text.read_times, self._note)
-        file = only_one([table for table, times in read.items() if len(times) == len(self.files)], self.folder, "times")
-        return (None, None) if file is None else (read[file].tolist(), file)
-
-    def _labelled_rows(self, labels: Sequence[str]) -> np.ndarray | None:
-        """Return the row of each file in a table whose rows have labels: by its name, its number, or in their order.
-
-        If the numbers of more than half of the files are there, and there are fewer or more rows than files, the others
-        have none (-1).
+        Else they are those of the only other file of so many times, which is also returned.
         """
-        stems = [Path(label).stem for label in labels]
-        row_of = dict(zip(stems, range(len(stems))))
-        if row_of.keys() >= {stem_of(path) for path in self.files}:
-            return np.array([row_of[stem_of(path)] for path in self.files])
-        numbers = [_number_of(stem_of(path)) for path in self.files]
-        numbered = dict(zip(map(_number_of, stems), range(len(stems))))
-        rows = np.array([numbered.get(number, -1) for number in numbers])
-        is_enough = (rows >= 0).mean() > (_LEAST_NAMED if len(stems) != len(self.files) else 1 - 1e-9)
-        if len(numbered) == len(stems) > 0 and is_enough and self._reaches(max(numbers), max(numbered)):
-            return rows
-        if len(row_of) != len(self.files) or len({re.sub(r"\d+", "", label) for label in labels}) > 1:
-            return None
-        return np.array(sorted(range(len(labels)), key=lambda row: natural_key(labels[row])))
+        file = resolve(self.folder, times, ("times.txt",), "times")
+        if file is not None:
+            stamps = poses_text.read_times(file)
+            rows = self._rows(len(stamps), what=f"times in {file}")
+            if rows is None:
+                raise CFlowError(f"{file} has {len(stamps)} times for {len(self.files)} sweeps; it needs one each")
+            return stamps[rows].tolist(), None
+        of_names = times_of_names([stem_of(path) for path in self.files])
+        if of_names is not None or times != "auto":
+            return of_names, None
+        read = read_all(find_times_files(self.folder, self.files), poses_text.read_times, self._note)
+        read = {table: known for table, known in read.items() if len(known) == len(self.files)}
+        table = only_one(list(read), self.folder, "times")
+        return (None, None) if table is None else (read[table].tolist(), table)
 
     def _rows(self, count: int, labels: Sequence[str] = (), what: str = "") -> np.ndarray | None:
         """Return the row of each file in a table of `count` rows, one per sweep; None = the table does not fit.
 
-        Labels of the rows may be the names of the files. If files are missing, their numbers tell the rows, from 0 or 1
-        on, and we say so if you pass `what` the rows are. The last number must be near the end of the table, else the
-        table is of another rate.
+        Labels of the rows may be the names of the files, or have their numbers. If they have those of more than half of
+        the files, the others have no row (-1). Labels of one kind without these numbers have the order of the files.
+        If there are no labels and files are missing, the numbers of the files tell the rows, from 0 or 1 on, and we say
+        so if you pass `what` the rows are.
         """
-        labelled = self._labelled_rows(labels) if len(labels) == count else None
-        if count == len(self.files) or labelled is not None:
-            return np.arange(count) if labelled is None else labelled
-        numbers = np.array([_number_of(stem_of(path)) % 10**9 for path in self.files])
+        stems = [stem_of(path) for path in self.files]
+        names = [Path(label).stem for label in labels] if len(labels) == count else []
+        row_of = dict(zip(names, range(count)))
+        if row_of.keys() >= set(stems):
+            return np.array([row_of[stem] for stem in stems])
+        least = _LEAST_NAMED if count != len(stems) else 1 - 1e-9
+        rows = self._rows_of_numbers([_number_of(name) for name in names], least)
+        if rows is None and len(row_of) == len(stems) and len({re.sub(r"\d+", "", label) for label in labels}) == 1:
+            rows = np.array(sorted(range(count), key=lambda row: natural_key(labels[row])))
+        if rows is not None or count == len(stems):
+            return np.arange(count) if rows is None else rows
         firsts = (0,) if self._numbers_are_rows else (0, 1)
-        fitting = [numbers - first for first in firsts if (numbers >= first).all() and (numbers < first + count).all()]
-        if len(fitting) != 1 or len(set(numbers)) < len(numbers) or not self._reaches(fitting[0].max(), count):
+        by_number = [self._rows_of_numbers(range(first, first + count), 1 - 1e-9) for first in firsts]
+        fitting = [each for each in by_number if each is not None]
+        if len(fitting) != 1:
             return None
-        self._note(
-            f"it has {count} {what} for {len(self.files)} sweeps, so each takes that of its number" if what else ""
-        )
+        self._note(f"it has {count} {what} for {len(stems)} sweeps, so each takes that of its number" if what else "")
         return fitting[0]
 
-    def _reaches(self, last: int, end: int) -> bool:
-        """Test whether the last number of a file may be a row of a table, by the end of the table."""
-        return self._numbers_are_rows or last >= _LEAST_REACH * end
+    def _rows_of_numbers(self, numbers: Sequence[int], least: float) -> np.ndarray | None:
+        """Return the row of the number of each file in a table whose rows have numbers, -1 = it has none.
+
+        None = the table does not fit: a number comes twice, it has those of at most a share `least` of the files, or
+        it goes on far behind the last file, so it is of another rate.
+        """
+        of_files = [_number_of(stem_of(path)) for path in self.files]
+        row_of = dict(zip(numbers, range(len(numbers))))
+        if not row_of or len(row_of) < len(numbers) or len(set(of_files)) < len(of_files):
+            return None
+        rows = np.array([row_of.get(number, -1) for number in of_files])
+        is_near_end = self._numbers_are_rows or max(of_files) >= _LEAST_REACH * max(row_of)
+        return rows if is_near_end and (rows >= 0).mean() > least else None
 
     def _pose_per_sweep(self, trajectory: Trajectory, stamps: list[int] | None) -> np.ndarray:
         trajectory = trajectory.counted(stamps)
@@ -340,10 +338,8 @@ class ArraysLog(Log):
                 count = f"{(~is_known).sum()} of {len(rows)} sweeps"
                 self._note(f"{count} have no pose, or one of NaN or zeros, in {source} and are left out")
             poses = trajectory.poses[rows][is_known]
-        kept = np.flatnonzero(is_known)
-        self.files, self.timestamps = [self.files[k] for k in kept], [self.timestamps[k] for k in kept]
-        self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
-        self.gaps = frozenset(np.flatnonzero(np.diff(kept) > 1).tolist())
+        kept = self._keep(is_known, f"{self.folder}: without the sweeps that have no pose, it")
+        self.files = [self.files[k] for k in kept]
         return poses
 
     def _gaps_in_numbers(self) -> list[int]:

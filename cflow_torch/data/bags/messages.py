@@ -148,11 +148,13 @@ class Frames:
         """
         chain = self.chain(frame)
         bases = [each for each in (*chain, *self._samples) if each.split("/")[-1] == BASE]
-        base = next((each for each in bases if self.are_joined(each, frame)), "")
+        related = [each for each in bases if self.are_joined(each, frame)]
+        # If both move in a frame that is above both, they are two vehicles.
+        related = [each for each in related if not (self.drives_in(each, frame) and self.drives_in(frame, each))]
         moving = [child for child in chain if self.is_moving(child)]
         inside = self.moving_in(frame)
-        if base:
-            return base
+        if related:
+            return related[0]
         if not moving or (inside and self._is_corrected(moving[0])):
             return inside[0] if len(inside) == 1 else ""
         carrying = chain[: chain.index(moving[0]) + 1]

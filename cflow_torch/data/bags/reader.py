@@ -133,7 +133,6 @@ class BagLog(Log):
             trajectory = self._find_poses(topics, poses, tracks)
             if trajectory is not None:
                 self._use_poses(trajectory)
-            self._check_count(f"{self.path}: {self.topic}, while there are poses,")
             self._period = float(np.median(np.diff(self.timestamps))) * 1e-9
             self.lidar_position = self._mount_at(self.timestamps[0])[:3, 3]
 
@@ -142,45 +141,35 @@ class BagLog(Log):
         has_clouds = _CLOUD in topics.values() or not set(_LIVOX) & set(topics.values())
         return self._chosen(topics, (_CLOUD,) if has_clouds and not name else (_CLOUD, *_LIVOX), name, "topic")
 
-    def _pose_source(self, topics: dict[str, str], poses: str | None, has_tracks: bool) -> str | None:
-        """Return "tf" or the topic of the poses; None = there are none."""
-        if poses == "auto" and len(self._frames.change_times(self.frame)) > 1:
-            return "tf"
-        if poses in (None, "tf") or (poses == "auto" and not has_tracks):
-            return None if poses == "auto" else poses
-        if poses != "auto":
-            return self._chosen(topics, (*_POSE_TYPES, *_OTHER_POSES), poses, "poses")
-        has_usual = not set(_POSE_TYPES).isdisjoint(topics.values())
-        return self._chosen(topics, _POSE_TYPES if has_usual else _OTHER_POSES, None, "poses")
-
     def _find_poses(self, topics: dict[str, str], poses: str | None, tracks: dict[str, Any]) -> Trajectory | None:
-        """Return the poses of the file that is named, of the bag or, with "auto", of a file near the bag."""
-        trajectory = self._poses_of_file(poses) or self._poses_of_bag(topics, poses, tracks)
-        if trajectory is None and poses == "auto":
-            trajectory = find_poses_near(
-                self.path.parent, self.log_id, self.timestamps, self._is_covered_by, self._note
-            )
-        return trajectory
+        """Return the poses of the file, topic or transforms that `poses` names or finds; None = there are none.
+
+        Clouds of another clock than transforms or a topic are shifted.
+        """
+        files = [] if poses is None else [path for path in (as_path(poses), self.path.parent / poses) if path.is_file()]
+        if files:
+            trajectory = read_poses(files[0])
+            if trajectory.times_ns is None:
+                raise CFlowError(f"{files[0]} has no times: give a bag poses with times (TUM)")
+            return trajectory
+        source = poses
+        if poses == "auto":
+            source = "tf" if len(self._frames.change_times(self.frame)) > 1 else None
+            if source is None and tracks:
+                has_usual = not set(_POSE_TYPES).isdisjoint(topics.values())
+                source = self._chosen(topics, _POSE_TYPES if has_usual else _OTHER_POSES, None, "poses")
+        elif poses not in (None, "tf"):
+            source = self._chosen(topics, (*_POSE_TYPES, *_OTHER_POSES), poses, "poses")
+        if source is not None:
+            times, matrices = self._find_trajectory(source, tracks)
+            self._set_clock(times)
+            return Trajectory(matrices, times, False, f"{source} of {self.path}")
+        if poses is None:
+            return None
+        return find_poses_near(self.path.parent, self.log_id, self.timestamps, self._is_covered_by, self._note)
 
     def _is_covered_by(self, trajectory: Trajectory) -> bool:
         return trajectory.covers(self.timestamps)
-
-    def _poses_of_bag(self, topics: dict[str, str], poses: str | None, tracks: dict[str, Any]) -> Trajectory | None:
-        """Return the poses of transforms or of a topic; None = there are none. Clouds of another clock are shifted."""
-        source = self._pose_source(topics, poses, bool(tracks))
-        if source is None:
-            return None
-        times, matrices = self._find_trajectory(source, tracks)
-        self._set_clock(times)
-        return Trajectory(matrices, times, False, f"{source} of {self.path}")
-
-    def _poses_of_file(self, poses: str | None) -> Trajectory | None:
-        """Return the poses of a file next to the bag, or of any other, see `read_poses`; None = this is not a file."""
-        files = [] if poses is None else [path for path in (as_path(poses), self.path.parent / poses) if path.is_file()]
-        trajectory = read_poses(files[0]) if files else None
-        if trajectory is not None and trajectory.times_ns is None:
-            raise CFlowError(f"{files[0]} has no times: give a bag poses with times (TUM)")
-        return trajectory
 
     def _use_poses(self, trajectory: Trajectory) -> None:
         """Take poses with times, and keep the sweeps that have one."""
@@ -188,7 +177,7 @@ class BagLog(Log):
         self.poses, is_covered, note = fit_to_sweeps(trajectory, self.timestamps)
         self._note(note)
         self.has_sparse_poses = trajectory.is_sparse(self.timestamps)
-        self.timestamps = [time for time, has_pose in zip(self.timestamps, is_covered) if has_pose]
+        self._keep(is_covered, f"{self.path}: {self.topic}, while there are poses,")
 
     def _mount_at(self, time: int) -> np.ndarray:
         """Return `T_ego_lidar` at a time, (4, 4) float64."""
@@ -211,7 +200,7 @@ class BagLog(Log):
     def _timed_cloud(self, time: int) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Read a cloud and the (N,) seconds of its points; None = unknown. We leave out points of stray times."""
         columns = self._cloud(time)
-        times = find_times(columns, time - self._clouds[time][1], self._period, points_of(columns), self._note)
+        times = find_times(columns, time - self._clouds[time][1], self._period, self._note)
         if times is None or times.seconds is None:
             return columns, None
         kept = ~times.is_stray

@@ -119,7 +119,7 @@ class HDF5Log(Log):
         if times is None or np.abs(times).max(initial=0) <= _LONGEST_LAG:
             return times if times is None else times.astype(np.float32)
         period = None if time is None else float(np.median(np.diff(self.timestamps))) * 1e-9
-        found = find_times({"time": times}, time, period, points, self._note)
+        found = find_times({"time": times}, time, period, self._note)
         if found is None or found.seconds is None:
             return None
         points[found.is_stray] = np.nan

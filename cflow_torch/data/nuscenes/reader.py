@@ -144,19 +144,18 @@ class NuScenesLog(Log):
 
     def _check_files(self, chain: Chain, kept: np.ndarray, step: int) -> None:
         """Say in one error if only key frames are there, or no file of the scene. We look at three files of a kind."""
-        kinds = []
+        has = {}
         for is_key_frame in (True, False):
             rows = kept[chain.is_key_frame[kept] == is_key_frame]
-            chosen = rows[[0, len(rows) // 2, -1]] if len(rows) else rows
-            kinds.append(any(self._has_file(chain.files[row]) for row in chosen))
-        if kinds == [True, False] and not chain.is_key_frame[kept].all():
+            has[is_key_frame] = any(self._has_file(chain.files[row]) for row in rows[:: len(rows) // 2 or 1])
+        if not any(has.values()):
+            raise CFlowError(
+                f"scene {self.log_id}: its files are not in {self._root}; another part of the set has them"
+            )
+        if not has[False] and not chain.is_key_frame[kept].all():
             raise CFlowError(
                 f"scene {self.log_id}: only its key frames are in {self._root}. Pass sweep_step={step} (in commands "
                 f"data.sweep_step={step}) to use them alone, at 2 Hz, or download the folder sweeps"
-            )
-        if not any(kinds):
-            raise CFlowError(
-                f"scene {self.log_id}: its files are not in {self._root}; another part of the set has them"
             )
 
     def _has_file(self, name: str) -> bool:

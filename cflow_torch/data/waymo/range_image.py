@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple, Sequence
 
 import numpy as np
-import torch
 
-from cflow_torch.transforms import to_rotations, transform_points
+from cflow_torch.transforms import rotations_of, transform_points
 from cflow_torch.types import CFlowError
 
 LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}
@@ -53,14 +52,6 @@ def directions(azimuth: np.ndarray, inclination: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(inclination)], axis=-1)
 
 
-def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
-    """Return the (N, 3, 3) float64 rotations Rz(yaw) Ry(pitch) Rx(roll) of (N, 3) roll, pitch, yaw in radians."""
-    from kornia.geometry.conversions import quaternion_from_euler
-
-    roll, pitch, yaw = torch.from_numpy(np.asarray(angles, dtype=np.float64)).unbind(1)
-    return to_rotations(torch.stack(quaternion_from_euler(roll, pitch, yaw), dim=1).numpy())
-
-
 def range_image_points(
     image: np.ndarray,
     calibration: LaserCalibration,
@@ -91,5 +82,5 @@ def range_image_points(
     if pixel_poses.shape != (num_rows, num_columns, 6):
         raise CFlowError(f"pixel poses have shape {pixel_poses.shape}, they must have ({num_rows}, {num_columns}, 6)")
     poses = pixel_poses.reshape(-1, 6)[pixels].astype(np.float64)
-    world = np.einsum("nij,nj->ni", rotations_from_angles(poses[:, :3]), points) + poses[:, 3:]
+    world = np.einsum("nij,nj->ni", rotations_of(poses[:, :3].T), points) + poses[:, 3:]
     return transform_points(world, np.linalg.inv(T_world_ego)), pixels
