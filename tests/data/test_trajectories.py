@@ -538,30 +538,6 @@ def test_poses_may_be_compressed_and_suffixes_large(tmp_path, name) -> None:
     assert ArraysLog(folder).poses is None
 
 
-def test_poses_may_be_arrays_of_the_clouds(tmp_path) -> None:
-    """A matrix, or a position and a quaternion; and a time, unless it is not in the order of the names."""
-    quaternions = to_quaternions(POSES[:, :3, :3])[:, (1, 2, 3, 0)]
-    forms = {
-        "pose, stamp": lambda k: {"pose": POSES[k], "stamp": 0.1 * k},
-        "stamp, translation, rotation": lambda k: {
-            "stamp": START + k * 10**8,
-            "translation": POSES[k, :3, 3],
-            "rotation": quaternions[k],
-        },
-        "pose": lambda k: {"pose": POSES[k], "stamp": -k},
-    }
-    for number, (name, arrays) in enumerate(forms.items()):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        for k in range(len(POSES)):
-            np.savez(folder / f"{k}.npz", pcl=np.ones((6, 3)), **arrays(k))  # the largest table is the cloud
-        with pytest.warns(CFlowWarning, match=f"its poses come from the arrays {name} of its clouds"):
-            log: Any = ArraysLog(folder)
-        assert np.allclose(log.poses, POSES, atol=1e-9) and log.has_viewpoints
-        assert log.sweep(3).points.shape == (6, 3)
-        assert np.diff(log.timestamps).tolist() == [10**8 if "stamp" in name else 1] * (len(POSES) - 1)
-
-
 def test_rotations_with_few_decimals_become_the_nearest_ones(tmp_path) -> None:
     tum = [f"{k} {k} 0 0 0 0 0.71 0.71" for k in range(12)]
     (tmp_path / "poses.txt").write_text("\n".join(tum))

@@ -26,7 +26,7 @@ from cflow_torch.types import CFlowError, check_array
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
 """Suffixes of clouds that are read and written. Texts (`cloud_text.SUFFIXES`), and `.gz` after any, are only read."""
 _COARSEST = 1e-3  # metres
-_LARGEST_POSE = 16  # numbers of an array that may be a pose or its time
+_LARGEST_POSE = 16  # numbers of an array that may be a pose
 _MOST_CHANNELS = 16  # of an organised cloud
 _MOST_COLUMNS = 64  # of a cloud with fewer points than columns; more are those of a cloud that is transposed
 _TABLES: dict[str, Any] = {  # suffix -> function that reads, and one that writes
@@ -92,14 +92,6 @@ def _other_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         if name.lower() not in AXES and values.shape == shape and kind.kind in "biuf" and kind.itemsize <= 8:
             kept[name] = values.astype(kind.newbyteorder("="), copy=False)
     return kept
-
-
-def small_arrays(path: Path) -> dict[str, Any]:
-    """Read the arrays of an `.npz` file that may be a pose or its time: up to 16 numbers, as nested lists."""
-    with file_errors(path, _hint(path)):
-        arrays = _plain_arrays(read_bytes(path))
-    small = {name: array for name, array in arrays.items() if array.size <= _LARGEST_POSE}
-    return {name: array.tolist() for name, array in small.items() if array.dtype.kind in "fiu"}
 
 
 def in_single(points: np.ndarray) -> np.ndarray:

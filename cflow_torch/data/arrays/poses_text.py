@@ -10,14 +10,7 @@ from typing import Any, Mapping, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays.stamps import nanoseconds_of_numbers
-from cflow_torch.data.arrays.tables import (
-    MATRIX,
-    Table,
-    as_decimals,
-    parse_table,
-    table_of,
-    tables_of_values,
-)
+from cflow_torch.data.arrays.tables import MATRIX, Table, parse_table, tables_of_values
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key, visible
@@ -106,23 +99,6 @@ def parse_poses(content: bytes, path: Path) -> Trajectory:
     if not found:
         raise error
     return max(found, key=lambda each: len(each.poses))  # ties: the outer one; calibrations have fewer
-
-
-def poses_of_members(members: Sequence[Mapping[str, object]]) -> Trajectory | None:
-    """Return the poses of dictionaries, one each, as in a file of JSON; None = they have none, or several matrices.
-
-    The source is the keys that hold them.
-    """
-    table = table_of(as_decimals(list(members)))
-    roles = _roles(table.names) if table is not None else {}
-    if table is None or not roles or sum(name.endswith(MATRIX[0]) for name in table.names) > 1:
-        return None
-    names, words, _ = table
-    if not _TIMES.isdisjoint(roles) and (np.diff(_nanoseconds(roles, words)) <= 0).any():  # not of the order of members
-        roles = {role: column for role, column in roles.items() if role not in _TIMES}
-        names = [name if column in roles.values() else "" for column, name in enumerate(names)]
-    keys = dict.fromkeys(names[column].partition(".")[0] for column in sorted(roles.values()))
-    return _poses_of_table(Table(names, words, []), Path(", ".join(keys)))
 
 
 def _poses_of_table(table: Table, path: Path) -> Trajectory:

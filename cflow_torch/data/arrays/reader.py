@@ -11,7 +11,7 @@ import numpy as np
 
 from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
-from cflow_torch.data.arrays.cloud_file import in_single, read_columns, read_table, small_arrays
+from cflow_torch.data.arrays.cloud_file import in_single, read_columns, read_table
 from cflow_torch.data.arrays.folder import (
     GROUND_FOLDER,
     find_clouds,
@@ -37,7 +37,7 @@ from cflow_torch.transforms import poses_from_quaternions, rigid_transform, tran
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.returns import missing_returns
 
-_VIEWPOINT, _ARRAYS = "VIEWPOINT", "the arrays"  # sources of poses that come with the clouds
+_VIEWPOINT = "VIEWPOINT"  # source of poses that come with the clouds
 _LEAST_NAMED = 0.5  # share of the sweeps whose numbers poses have, if poses have numbers
 _LEAST_REACH = 0.8  # part of a table after which the row of the last file is, unless the layout says so
 _LEAST_USUAL = 2 / 3  # share of steps between the numbers of files that are equal, or the numbers are irregular
@@ -50,9 +50,9 @@ class ArraysLog(Log):
         folder: of a log, see `find_array_logs`. Clouds are sorted by the times in their names, else naturally: 2
             before 10.
         poses: "auto" = one of `POSE_FILES` in the folder, or KITTI's ../../poses/<name>.txt, or the only file or
-            folder there whose contents are poses, or VIEWPOINT of `.pcd` files if it is set, or those in arrays of
-            each `.npz` file, or the only file of text in a folder near this one that has poses at the unix times of the
-            sweeps; None = no poses; or a file (see `read_poses`); or a (K, 4, 4) array.
+            folder there whose contents are poses, or VIEWPOINT of `.pcd` files if it is set, or the only file of text
+            in a folder near this one that has poses at the unix times of the sweeps; None = no poses; or a file (see
+            `read_poses`); or a (K, 4, 4) array.
         poses_of: whose poses these are: "ego", "lidar", or "sensor" = of another sensor. Then `ego_T_lidar` maps to
             this sensor, the ego frame is the LiDAR's, and the points stay. "auto" = of the LiDAR if `ego_T_lidar` is
             given and the static world then stands still clearly better, else "ego".
@@ -74,8 +74,7 @@ class ArraysLog(Log):
             is one pose per sweep, or each sweep takes that of its name or number.
         trajectory: times and `T_world_ego` of all poses, by which `DeskewedLog` moves points; None = without times.
         bin_layout: numbers of a point of `.bin` files, None for files of another suffix.
-        has_viewpoints: whether the poses come from VIEWPOINT or arrays of the clouds. Such clouds are often in the
-            world's frame (`read_as`).
+        has_viewpoints: whether the poses come from VIEWPOINT. Such clouds are often in the world's frame (`read_as`).
 
     Convention:
         `missing_returns` stay, as NaN, so that results have a row for every row of the file. Sweeps are in the ego
@@ -125,9 +124,8 @@ class ArraysLog(Log):
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
         self.poses = None if trajectory is None else self._pose_per_sweep(_of_ego(trajectory, whose, mounting), stamps)
         self.gaps |= frozenset(self._gaps_in_numbers())
-        self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAYS))
-        if trajectory is not None and self.has_viewpoints:
-            self._note(f"its poses come from {trajectory.source}")
+        self.has_viewpoints = trajectory is not None and trajectory.source == _VIEWPOINT
+        self._note(f"its poses come from {_VIEWPOINT}" if self.has_viewpoints else "")
         if whose == "auto" and ego_T_lidar is not None and self.poses is not None:
             self._ask_whose_poses()
 
@@ -235,10 +233,7 @@ class ArraysLog(Log):
         return self._rows(len(trajectory.poses), trajectory.labels) is not None
 
     def _viewpoints(self) -> Trajectory | None:
-        """Read the poses in VIEWPOINT of `.pcd` files, or in arrays of `.npz` files; None if no file has one."""
-        if suffix_of(self.files[0]) == ".npz":
-            trajectory = poses_text.poses_of_members([small_arrays(file) for file in self.files])
-            return trajectory and trajectory._replace(source=f"{_ARRAYS} {trajectory.source} of its clouds")
+        """Read the poses in VIEWPOINT of `.pcd` files; None if no file has one."""
         if suffix_of(self.files[0]) != ".pcd":
             return None
         numbers = np.tile(np.eye(7)[3], (len(self.files), 1))

@@ -126,21 +126,13 @@ def tables_of_values(content: bytes, path: Path) -> Iterator[Table]:
     """
     value = _value_of(content, path)
     for labels, members in (*_series(value), ([], [value])):
-        table = table_of(members, labels)
-        if table is not None:
-            yield table
-
-
-def table_of(members: Sequence[Any], labels: Sequence[str] = ()) -> Table | None:
-    """Return the table whose rows are members that are mostly alike, see `tables_of_values`; None = they are not."""
-    rows = [dict(_numbers_of(member, "")) for member in members]
-    names = max(rows, key=len, default={}).keys()
-    if not names or 2 * sum(row.keys() == names for row in rows) <= len(rows):
-        return None
-    texts = list(labels) or [_text_of(member) for member in members]
-    words = [[row.get(name, "nan") for name in names] for row in rows]
-    table = np.array(words, str)
-    return Table(_name_sevens(list(names), table), table, texts if len({*texts, ""}) > len(texts) else [])
+        rows = [dict(_numbers_of(member, "")) for member in members]
+        names = max(rows, key=len, default={}).keys()
+        if not names or 2 * sum(row.keys() == names for row in rows) <= len(rows):
+            continue
+        texts = labels or [_text_of(member) for member in members]
+        words = np.array([[row.get(name, "nan") for name in names] for row in rows], str)
+        yield Table(_name_sevens(list(names), words), words, texts if len({*texts, ""}) > len(texts) else [])
 
 
 def _value_of(content: bytes, path: Path) -> Any:
@@ -149,21 +141,21 @@ def _value_of(content: bytes, path: Path) -> Any:
     with file_errors(f"{path} as {kind[1:]}"):
         if kind == ".npz":
             with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-                return {name: as_decimals(archive[name].tolist()) for name in archive.files}
+                return {name: _as_decimals(archive[name].tolist()) for name in archive.files}
         text = content.decode("utf-8-sig")
         if kind in (".yaml", ".yml"):
             documents = list(yaml.load_all(text, getattr(yaml, "CBaseLoader", yaml.BaseLoader)))
-            return as_decimals(documents[0] if len(documents) == 1 else documents)
+            return _as_decimals(documents[0] if len(documents) == 1 else documents)
         parse = partial(json.loads, parse_float=Decimal, parse_int=Decimal)
         return list(map(parse, text.splitlines())) if kind == ".jsonl" else parse(text)
 
 
-def as_decimals(value: Any) -> Any:
+def _as_decimals(value: Any) -> Any:
     """Return nested lists and dictionaries with Decimals in place of numbers and their texts."""
     if isinstance(value, dict):
-        return {key: as_decimals(member) for key, member in value.items()}
+        return {key: _as_decimals(member) for key, member in value.items()}
     if isinstance(value, list):
-        return [as_decimals(member) for member in value]
+        return [_as_decimals(member) for member in value]
     return Decimal(str(value)) if is_number(str(value)) else value
 
 

@@ -200,7 +200,7 @@ class BagLog(Log):
     def _timed_cloud(self, time: int) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Read a cloud and the (N,) seconds of its points; None = unknown. We leave out points of stray times."""
         columns = self._cloud(time)
-        times = find_times(columns, time - self._clouds[time][1], self._period, self._note)
+        times = find_times(columns, self._clouds[time][1], self._period, self._note)
         if times is None or times.seconds is None:
             return columns, None
         kept = ~times.is_stray
@@ -298,7 +298,7 @@ class BagLog(Log):
                 frame = _frame_of(message)
                 self._lidar = self._lidar or frame
                 if frame == self._lidar:
-                    stamps.append((_stamp(message), arrived))
+                    stamps.append((_stamp(message, 0), arrived))
                 else:
                     self._note(f"its clouds are of several sensors: we read those in {self._lidar}, not in {frame}")
             elif connection.msgtype in _TF_TYPES:
@@ -336,20 +336,19 @@ class BagLog(Log):
         self._child[topic] = getattr(message, "child_frame_id", "").lstrip("/")
 
     def _timed(self, stamps: list[tuple[int, int]]) -> dict[int, tuple[int, int]]:
-        """Return the arrival of each cloud by its time, and by how much the time differs from the stamp.
+        """Return the arrival and the stamp of each cloud by its time.
 
-        If a stamp is 0, the arrival takes its place.
         Stamps that hardly grow from one arrival to the next are replaced by the arrivals. If they fall, and the delays
         grow at once, a clock was set back, and we let it run on. A note says what was done.
 
         Args:
-            stamps: of each cloud, that of its header and its arrival, in the order of arrival.
+            stamps: of each cloud, its stamp, which may be 0, and its arrival, in the order of arrival.
         """
         is_same = [abs(b[0] - a[0]) < (b[1] - a[1]) / _SLOWEST for a, b in zip(stamps, stamps[1:])]
         if sum(is_same) > max(len(stamps) // 2 - 1, 0):
             count = len(stamps) - sum(is_same)
             self._note(f"its {len(stamps)} clouds have {count} different time stamps, so we use their times of arrival")
-            return {arrived: (arrived, arrived - (stamp or arrived)) for stamp, arrived in stamps}
+            return {arrived: (arrived, stamp or arrived) for stamp, arrived in stamps}
         arrival: dict[int, int] = {}
         for stamp, arrived in stamps:
             arrival.setdefault(stamp or arrived, arrived)  # clouds that are played twice repeat their stamps
@@ -366,7 +365,7 @@ class BagLog(Log):
                 back = _middle(after) - _middle(before)
                 shift[k:] += back
                 self._note(f"the clock of its clouds was set back by {back * 1e-9:.3g} s, so we add that to later ones")
-        return {stamp + by: (arrived, by) for (stamp, arrived), by in zip(first, shift.tolist())}
+        return {stamp + by: (arrived, stamp) for (stamp, arrived), by in zip(first, shift.tolist())}
 
     def _set_clock(self, pose_times: np.ndarray) -> None:
         """Shift the times of clouds to the clock of the poses, by the times of arrival, if the clocks surely differ.
@@ -385,7 +384,7 @@ class BagLog(Log):
         if do_overlap and sum(are_early) != 1:
             self._note(f"clocks of its clouds and poses differ by {seconds}: if static points move, correct one")
             return
-        self._clouds = {time + shift: (arrived, by + shift) for time, (arrived, by) in self._clouds.items()}
+        self._clouds = {time + shift: cloud for time, cloud in self._clouds.items()}
         self.timestamps = sorted(self._clouds)
         self._note(
             f"the times of its clouds and of its poses have different clocks ({seconds}), so we shift those of the "
@@ -416,11 +415,11 @@ class BagLog(Log):
     def _cloud(self, time: int) -> dict[str, np.ndarray]:
         """Read the `cloud_columns` of the cloud at a time."""
         with file_errors(f"{self.path}, {self.topic} at {time} ns"):
-            reader, (arrived, shift) = self._reader(), self._clouds[time]
+            reader, (arrived, stamp) = self._reader(), self._clouds[time]
             clouds = [connection for connection in reader.connections if connection.topic == self.topic]
             for connection, _, data in reader.messages(clouds, start=arrived, stop=arrived + 1):
                 message = reader.deserialize(data, connection.msgtype)
-                if (_stamp(message) or arrived) + shift == time and _frame_of(message) == self._lidar:
+                if _stamp(message, arrived) == stamp and _frame_of(message) == self._lidar:
                     return cloud_columns(message)
             raise CFlowError("the cloud is gone; was the bag changed?")
 
@@ -438,10 +437,10 @@ def _middle(values: list[int]) -> int:
     return sorted(values)[len(values) // 2] if values else 0
 
 
-def _stamp(message: Any) -> int:
-    """Return the time of a header in nanoseconds."""
+def _stamp(message: Any, arrived: int) -> int:
+    """Return the time of a header in nanoseconds, that of arrival if it is 0."""
     stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or arrived
 
 
 def _frame_of(message: Any) -> str:
@@ -451,9 +450,9 @@ def _frame_of(message: Any) -> str:
 def _pose_of(message: Any, arrived: int) -> Sample:
     """Return the pose of an Odometry, a PoseStamped, a PoseWithCovarianceStamped or a TransformStamped."""
     if hasattr(message, "transform"):
-        return sample(_stamp(message) or arrived, message.transform.translation, message.transform.rotation)
+        return sample(_stamp(message, arrived), message.transform.translation, message.transform.rotation)
     pose = getattr(message.pose, "pose", message.pose)
-    return sample(_stamp(message) or arrived, pose.position, pose.orientation)
+    return sample(_stamp(message, arrived), pose.position, pose.orientation)
 
 
 def _driven(message: Any, arrived: int) -> list[Sample]:
