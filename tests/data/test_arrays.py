@@ -118,6 +118,25 @@ def test_clouds_are_read_from_texts(tmp_path, suffix):
         assert np.array_equal(log.columns(1)["t"], tables[1, :, 3])
 
 
+HEADERS = {
+    ".pcd": "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 6\nHEIGHT 1\nDATA ascii\n",
+    ".ply": "ply\nformat ascii 1.0\nelement vertex 6\n%send_header\n" % "".join(f"property float {a}\n" for a in "xyz"),
+    ".xyz": "",
+    ".csv": "x,y,z\n",
+}
+
+
+@pytest.mark.parametrize("nan", ["-nan(ind)", "nan(snan)", "1.#QNAN", "-1.#IND", "-nan"])
+@pytest.mark.parametrize("suffix", HEADERS)
+def test_missing_returns_in_texts_of_windows_are_nan(tmp_path, suffix, nan):
+    rows = [f"{k}.5 2 3" for k in range(5)]
+    rows.insert(1, f"{nan} {nan} {nan}")
+    text = HEADERS[suffix] + "\n".join(rows) + "\n"
+    (tmp_path / f"a{suffix}").write_text(text.replace(" ", ",") if suffix == ".csv" else text)
+    points = read_cloud(tmp_path / f"a{suffix}")
+    assert np.isnan(points[1]).all() and points[[0, 2, 5], 0].tolist() == [0.5, 1.5, 4.5]
+
+
 def test_texts_that_are_no_clouds_stay_tables(tmp_path):
     """Two trajectories have names of one pattern, too."""
     t = np.arange(60.0)

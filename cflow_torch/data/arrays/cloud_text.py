@@ -14,6 +14,7 @@ from cflow_torch.types import CFlowError
 
 SUFFIXES = (".csv", ".txt", ".xyz", ".pts", ".asc")
 _START = 1 << 16  # bytes that tell the columns
+_NO_NUMBER = re.compile(rb"-?(?:nan\(\w*\)|1\.#\w+)", re.IGNORECASE)
 
 
 def text_columns(content: bytes) -> dict[str, np.ndarray]:
@@ -22,6 +23,7 @@ def text_columns(content: bytes) -> dict[str, np.ndarray]:
     Numbers are separated by commas, semicolons (then a decimal may have a comma) or blanks. Names are those that
     `start_of_rows` finds. Empty numbers are NaN.
     """
+    content = with_plain_nan(content)
     lines = [line.strip() for line in content[:_START].decode("utf-8-sig", "replace").splitlines()]
     start, names = start_of_rows(lines, len(AXES))
     if start == len(lines) or len(split_line(lines[start])) < len(AXES):
@@ -52,3 +54,8 @@ def text_columns(content: bytes) -> dict[str, np.ndarray]:
         columns = [column[rows] for column in columns[1:]] if begin else columns
         names = default_names(len(columns))
     return {name: values for name, values in zip(names, columns) if values.dtype.kind in "biuf"}
+
+
+def with_plain_nan(content: bytes) -> bytes:
+    """Return a text in which NaN and infinity are nan where programs on Windows write -nan(ind) or 1.#QNAN."""
+    return _NO_NUMBER.sub(b"nan", content)

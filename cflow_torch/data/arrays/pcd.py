@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from cflow_torch.data.arrays.cloud_text import with_plain_nan
 from cflow_torch.data.column_names import distinct_names
 from cflow_torch.errors import import_optional
 
@@ -24,7 +25,8 @@ def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
     """
     header, end = _header(content)
     text = "".join(f"{key} {' '.join(words)}\n" for key, words in header.items())
-    cloud = pypcd4().PointCloud.from_fileobj(io.BytesIO(text.encode("utf-8") + content[end:]))
+    body = with_plain_nan(content[end:]) if header["DATA"] == ["ascii"] else content[end:]
+    cloud = pypcd4().PointCloud.from_fileobj(io.BytesIO(text.encode("utf-8") + body))
     width, height = int(header["WIDTH"][0]), int(header["HEIGHT"][0])
     table = np.atleast_1d(cloud.pc_data)
     if len(table) != width * height:

@@ -11,6 +11,7 @@ from typing import Mapping, NamedTuple, Sequence
 
 import numpy as np
 
+from cflow_torch.data.arrays.cloud_text import with_plain_nan
 from cflow_torch.data.column_names import distinct_names
 
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -82,7 +83,7 @@ def _parsed(content: bytes) -> tuple[str, list[_Element], bytes]:
 
 
 def _text_table(body: bytes, before: Sequence[_Element], vertex: _Element) -> np.ndarray:
-    lines = [line for line in body.decode("latin-1").splitlines() if line.strip()]
+    lines = [line for line in with_plain_nan(body).decode("latin-1").splitlines() if line.strip()]
     first = sum(element.num_rows for element in before)
     rows = lines[first : first + vertex.num_rows]
     if vertex.has_lists:
