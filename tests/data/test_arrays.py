@@ -118,9 +118,10 @@ def test_clouds_are_read_from_texts(tmp_path, suffix):
         assert np.array_equal(log.columns(1)["t"], tables[1, :, 3])
 
 
+PROPERTIES = "".join(f"property float {axis}\n" for axis in "xyz")
 HEADERS = {
     ".pcd": "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 6\nHEIGHT 1\nDATA ascii\n",
-    ".ply": "ply\nformat ascii 1.0\nelement vertex 6\n%send_header\n" % "".join(f"property float {a}\n" for a in "xyz"),
+    ".ply": f"ply\nformat ascii 1.0\nelement vertex 6\n{PROPERTIES}end_header\n",
     ".xyz": "",
     ".csv": "x,y,z\n",
 }
