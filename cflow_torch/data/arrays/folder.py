@@ -248,7 +248,7 @@ def find_pose_files(folder: Path, clouds: Container[Path] = ()) -> list[Path]:
     poses = [path for path in _tables(folder, clouds) if path.name in POSE_FILES or _num_poses(path) > 1]
     for path in sorted(path for path in visible(folder) if path.is_dir() and _holds_no_labels(path)):
         files = files_of_poses(path)
-        poses += [path] if len(files) > 1 and _num_poses(files[0]) == 1 else []
+        poses += [path] if len(files) > 1 and _num_poses(files[0], _TESTED) == 1 else []
     return poses
 
 
@@ -375,18 +375,18 @@ def read_all(files: Sequence[Path], read: Callable[[Path], Any], tell: Callable[
     return found
 
 
-def _num_poses(path: Path) -> int:
-    """Return the number of poses at the start of a file, 0 = it holds none."""
-    start = _start_of(path, parse_poses)
+def _num_poses(path: Path, largest: int = _LARGEST) -> int:
+    """Return the number of poses at the start of a file, 0 = it holds none, or is structured and larger (bytes)."""
+    start = _start_of(path, parse_poses, largest)
     return 0 if start is None else len(start.poses)
 
 
-def _start_of(path: Path, parse: Callable[[bytes, Path], Any]) -> Any:
-    """Parse the first lines of a file; None = this is not possible."""
+def _start_of(path: Path, parse: Callable[[bytes, Path], Any], largest: int = _LARGEST) -> Any:
+    """Parse the first lines of a text, or a structured file of up to so many bytes; None = this is not possible."""
     try:
         with file_errors(path):
             is_whole = suffix_of(path) in STRUCTURED
-            start = read_start(path, _LARGEST if is_whole else _TESTED)
+            start = read_start(path, largest if is_whole else _TESTED)
             if not is_whole and len(start) == _TESTED:  # whole lines, and whole matrices of four or five
                 lines = start.splitlines(keepends=True)[:-1]
                 start = b"".join(lines[: len(lines) // 20 * 20] or lines[: len(lines) // 4 * 4])
