@@ -127,7 +127,7 @@ def write_cloud(
     """
     path, points = as_path(path), np.asarray(points)
     named: dict[str, Any] = dict(columns or {})
-    suffix = _suffix(path)
+    suffix = _checked_suffix(path, path.suffix.lower())
     check_array(points, "points", (None, 3), "f", "(N, 3) floats, metres")
     for name, values in named.items():
         check_array(values, f"column {name}", (len(points),), "biuf", f"({len(points)},) numbers, one per point")
@@ -171,7 +171,7 @@ def copy_rows(source: PathLike, target: PathLike, is_kept: np.ndarray, layout: B
         CFlowError: the source cannot be read, or has another number of points.
     """
     source = as_path(source)
-    suffix = _suffix(source)
+    suffix = _checked_suffix(source, source.suffix.lower())
     with file_errors(source, _hint(source)):
         content = read_bytes(source)
         number = len(_positions(_read(source, layout))[0])
@@ -205,12 +205,7 @@ def _write_pcd(file: Any, fields: Mapping[str, np.ndarray], viewpoint: Any) -> N
     cloud.save(file, pcd.Encoding.BINARY)
 
 
-def _suffix(path: Path) -> str:
-    """Return the suffix of a cloud to write."""
-    return _checked_suffix(path, path.suffix.lower(), SUFFIXES)
-
-
-def _checked_suffix(path: Path, suffix: str, allowed: Sequence[str]) -> str:
+def _checked_suffix(path: Path, suffix: str, allowed: Sequence[str] = SUFFIXES) -> str:
     if suffix not in allowed:
         raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(allowed)}")
     return suffix

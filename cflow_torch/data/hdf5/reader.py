@@ -186,13 +186,14 @@ class HDF5Log(Log):
     def _matrix(self, index: int, key: str, dtype: Any) -> np.ndarray | None:
         """Read a rigid transform, (4, 4); a file may have only its upper three rows, or x y z qx qy qz qw."""
         matrix = self._values(index, key, None, dtype)
-        if matrix is not None and matrix.shape == (7,):
+        if matrix is None or matrix.shape == (4, 4):
+            return matrix  # type: ignore[no-any-return]
+        if matrix.shape == (3, 4):
+            return np.concatenate([matrix, np.eye(4, dtype=matrix.dtype)[3:]])
+        if matrix.shape == (7,):
             where = f"{self.file}: {key} of sweep {self.sweep_name(index)}"
             return poses_from_quaternions(matrix[:3], matrix[[6, 3, 4, 5]], lambda _: where)[0]
-        if matrix is not None and matrix.shape == (3, 4):
-            return np.concatenate([matrix, np.eye(4, dtype=matrix.dtype)[3:]])
-        is_square = matrix is None or matrix.shape == (4, 4)
-        return matrix if is_square else self._values(index, key, (4, 4), dtype)  # raises the error
+        return self._values(index, key, (4, 4), dtype)  # type: ignore[no-any-return]  # raises the error
 
     def _stored_pose(self, index: int, dtype: Any = np.float64) -> Any:
         """Read a pose, or compute it from the pose before and the ego motion; None = it is unknown."""
