@@ -97,8 +97,10 @@ def as_numpy(value: Array, dtype: Any | None = None) -> np.ndarray:
 def point_rows(name: str, values: Array, count: int | None = None) -> np.ndarray:
     """Check an array with a row per point, and return it as (N, 3) float64. `count` is N; None = any N."""
     array = as_numpy(values)
+    wanted = "(N, 3)" if count is None else f"({count}, 3)"
+    if array.dtype == object:
+        raise CFlowError(f"{name} is {type(values).__name__}: give an array {wanted}, such as sweep.points")
     if array.ndim != 2 or array.shape[1] < 3 or (count is not None and len(array) != count):
-        wanted = "(N, 3)" if count is None else f"({count}, 3)"
         raise CFlowError(f"{name} has shape {array.shape}: give {wanted}, one row per point")
     return array[:, :3].astype(np.float64)
 
