@@ -371,7 +371,7 @@ def test_an_object_that_is_clicked_is_described_and_followed(browser: Any, drive
 # Number of labels that a panel or an edge of the screen covers in part.
 NUM_CUT = """[...document.querySelectorAll("#labels span:not([hidden])")].map(e => e.getBoundingClientRect()).filter(
   a => a.left < 0 || a.right > innerWidth || a.top < 0 || a.bottom > innerHeight ||
-  ["head", "objects", "side", "time"].map(id => document.getElementById(id).getBoundingClientRect()).some(
+  ["head", "objects", "side", "time", "rose"].map(id => document.getElementById(id).getBoundingClientRect()).some(
     b => a.right > b.left && a.left < b.right && a.bottom > b.top && a.top < b.bottom)).length"""
 
 
