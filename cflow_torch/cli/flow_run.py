@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from concurrent.futures import BrokenExecutor
 from contextlib import suppress
 from dataclasses import asdict
 from time import perf_counter
@@ -18,6 +19,7 @@ from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.catalog import source_name
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
+from cflow_torch.fleet.executors import Executor
 from cflow_torch.fleet.job import Job, Part, find_shard
 from cflow_torch.fleet.machine import choose_batch, choose_devices, frames_per_worker
 from cflow_torch.fleet.manifest import check_logs, clear_log
@@ -26,6 +28,7 @@ from cflow_torch.fleet.ray_engine import ray_executors
 from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
 from cflow_torch.fleet.work import open_quickly
 from cflow_torch.setting import AUTO
+from cflow_torch.types import CFlowError
 
 _ENGINES: dict[str, Callable[..., Any]] = {"local": local_executors, "ray": ray_executors}
 
@@ -74,15 +77,16 @@ class FlowRun:
         """Write the flow files of this shard, and return the report of `run_fleet`."""
         read_config(ensure_writable(self.output))  # one of others fails now, not when logs are cleared
         self._check_output()
-        if self._cfg.overwrite and self.shard.count == 1:
-            for log in self.open_logs():
-                clear_log(self.output / log.log_id, TRACK_FILES)
-        write_config(self._cfg, self.output)
         devices = self._useful_devices()
         settings = asdict(self._cfg.engine)
         name = settings.pop("name")
         own = {key: value for key, value in settings.items() if key not in ("workers", "batch")}
         with _ENGINES[name](self.job, devices, **own) as executors:
+            if self._cfg.overwrite and self.shard.count == 1:
+                _start(executors[0])
+                for log in self.open_logs():
+                    clear_log(self.output / log.log_id, TRACK_FILES)
+            write_config(self._cfg, self.output)
             parts = self.shard.parts(self.logs.sources, len(devices))
             about = {"config": settings_record(self._cfg), "versions": versions()}
             report = run_fleet(executors, parts, self.job, devices, self.shard, name, about)
@@ -126,3 +130,12 @@ class FlowRun:
             if count >= least * len(self._devices):
                 break
         return self._devices[: max(1, count // least)]
+
+
+def _start(executor: Executor) -> None:
+    """Start a worker. If it cannot start, for example on a broken GPU, that is a `CFlowError`."""
+    try:
+        executor.call("next_event", False)  # a worker without a part has no event
+    except (BrokenExecutor, CFlowError) as error:
+        executor.close()
+        raise CFlowError(f"no worker can start: {error}") from error

@@ -64,6 +64,8 @@ def test_flow_touches_only_the_logs_of_its_run(drives, tmp_path, cflow, capsys):
     assert cflow(*call, drives[1], "model.connectivity=4") == 0, "another method, another log"
     assert cflow(*call, drives[0], "model.connectivity=4") == 2
     assert "drive_1 has results of another run (method.connectivity was 8, is 4)" in capsys.readouterr().err
+    assert cflow(*call, drives[0], "overwrite=true", "device=cuda:99") == 2
+    assert "device=cuda:99 cannot be used" in capsys.readouterr().err
     assert cflow(*call, drives[1], "overwrite=true") == 0
     assert times(tmp_path / "out" / "drive_1") == first
     assert cflow(*call, *drives) == 0
