@@ -188,6 +188,8 @@ def test_a_failure_ends_a_run_but_not_a_sweep(monkeypatch):
     failures.finish([])
     with pytest.raises(failures.UnfinishedJob, match="1"):
         failures.finish([("a", "bad")])
+    with pytest.raises(SystemExit, match="130"):
+        failures.end_unfinished("stopped by Ctrl-C", 130)
 
 
 def test_the_first_line_has_the_scores_and_names_classes_with_few_points():
