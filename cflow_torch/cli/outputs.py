@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from cflow_torch import __version__
-from cflow_torch.cli.choices import known_settings
+from cflow_torch.cli.choices import free_names
 from cflow_torch.cli.commands import Command, Submit
 from cflow_torch.cli.failures import is_sweep
 from cflow_torch.cli.info import processor
@@ -106,9 +106,7 @@ def check_made_by(cfg: Command, folder: Path, before: Any, now: Any) -> None:
 
     Settings that are `free` may differ.
     """
-    known = known_settings(type(cfg))
-    free = [name for name, owners in known.items() if any(limits and limits["free"] for limits in owners.values())]
-    check_same_run(folder, json_ready(before), now, free)
+    check_same_run(folder, json_ready(before), now, free_names(type(cfg)))
 
 
 def claim_output(cfg: Submit, folder: Path, results: Sequence[Path]) -> None:
