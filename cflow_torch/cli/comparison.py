@@ -19,17 +19,22 @@ RESULTS = "results.json"
 COMPARISON = "comparison.csv"
 # The scores of a class with fewer dynamic points are uncertain. One pedestrian has about 1000 in ten sweeps.
 _FEW = 1000
+FAILED = "failed pairs or logs"
 _SCORES = {  # those that no job has are left out
     "moving IoU": "moving_iou",
     "mean dynamic error": "dynamic_error",
     "EPE FD [m]": "epe_fd",
     "EPE BS [m]": "epe_bs",
     "seconds a frame": "seconds",
+    FAILED: "failed",
 }
 
 
 class Comparison(Callback):
-    """After `cflow eval -m`, print a table of all jobs in OUTPUT, and write it to OUTPUT/comparison.csv."""
+    """After `cflow eval -m`, print a table of all jobs in OUTPUT, and write it to OUTPUT/comparison.csv.
+
+    The exit status is 1 if pairs or logs of one of these jobs failed.
+    """
 
     def on_multirun_end(self, config: Any, **kwargs: Any) -> None:
         if "experiment_name" not in config:  # another command
@@ -38,7 +43,7 @@ class Comparison(Callback):
         from cflow_torch.data.paths import as_path
         from cflow_torch.evaluation.tables import markdown
 
-        output = as_path(config.output)
+        output = as_path(config["output"])
         header, rows = compare(output)
         if rows:
             text = io.StringIO()
@@ -46,6 +51,8 @@ class Comparison(Callback):
             write_text(output / COMPARISON, text.getvalue())
             shown = [[f"{cell:.4g}" if isinstance(cell, float) else cell for cell in row] for row in rows]
             print("\n".join([f"all jobs in {output}, also in {output / COMPARISON}:", "", *markdown(header, shown)]))
+        if FAILED in header:
+            raise SystemExit(1)
 
 
 def compare(output: Path) -> tuple[list[str], list[list[Any]]]:
@@ -60,6 +67,7 @@ def compare(output: Path) -> tuple[list[str], list[list[Any]]]:
         try:
             record = json.loads(file.read_text(encoding="utf-8"))
             scores = headline(record["results"], record["seconds_per_pair"])
+            scores["failed"] = len(record["failures"]) or math.nan
             settings, named = _settings(record["config"])
             settings["scored data"] = record["data"]["digest"]
         except (ValueError, KeyError, TypeError) as error:

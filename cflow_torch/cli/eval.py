@@ -62,7 +62,7 @@ def task(cfg: Eval) -> float:
     if scores.metrics.counts["num_frames"] == 0:
         raise CFlowError("no pair has labels, so there is nothing to score; `cflow flow` needs no labels")
     results = scores.report(output, logs, time_report(times), failures)
-    with suppress(UnfinishedJob):  # a job of a sweep returns its score; a single run exits with status 1
+    with suppress(UnfinishedJob):  # a job of a sweep returns its score; `Comparison` gives the exit status
         finish(failures)
     return objective(results)
 

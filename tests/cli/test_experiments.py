@@ -14,7 +14,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cflow_torch.cli.choices import FOLDER
-from cflow_torch.cli.comparison import compare
+from cflow_torch.cli.comparison import FAILED, Comparison, compare
 from cflow_torch.cli.eval import objective
 from cflow_torch.config import Config, make_config
 from cflow_torch.data.json_file import write_json
@@ -76,6 +76,11 @@ def test_a_sweep_keeps_every_result_and_resumes(log_folder, tmp_path, cflow, cap
     assert capsys.readouterr().out.splitlines()[-4].startswith(titles)
 
     before = {file: file.stat().st_mtime_ns for file in files}
+    records[1]["failures"] = [["log", "bad"]]
+    files[1].write_text(json.dumps(records[1]))
+    assert FAILED in compare(tmp_path)[0]
+    with pytest.raises(SystemExit, match="1"):
+        Comparison().on_multirun_end({"output": tmp_path, "experiment_name": None})
     files[1].unlink()  # as if it had been stopped there
     assert cflow(*call) == 0
     assert capsys.readouterr().out.count("skipped, its results exist") == 1
@@ -87,7 +92,7 @@ def test_a_sweep_keeps_every_result_and_resumes(log_folder, tmp_path, cflow, cap
 def test_the_comparison_has_the_settings_in_which_jobs_differ_and_names_other_data(tmp_path, capsys):
     def write(job: str, digest: str, model: Config, **config: Any) -> None:
         results = {"bucketed": {"mean": {"dynamic_error": 0.5}}, "three_way": {"epe_fd": 0.25, "epe_bs": None}}
-        record = {"results": results, "seconds_per_pair": {"median": 2.0}, "data": {"digest": digest}}
+        record = {"results": results, "seconds_per_pair": {"median": 2.0}, "data": {"digest": digest}, "failures": []}
         settings = {"output": job, "model": model.as_dict(), "definition": "av2", **config}
         (tmp_path / job).mkdir(parents=True)
         write_json(tmp_path / job / "results.json", {**record, "config": settings})
