@@ -7,6 +7,7 @@ import sys
 from concurrent.futures import BrokenExecutor
 from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from time import perf_counter
 from typing import Any, Callable, Iterator, Sequence
 
@@ -93,25 +94,24 @@ class FlowRun:
         self._computed = perf_counter()
         return report
 
-    def finish(self, report: dict[str, Any], failures: Failures) -> None:
+    def finish(self, report: dict[str, Any], failures: Failures, *copies: Path) -> None:
         """Print the report and what is missing, and exit with the status of the run unless it is complete.
 
-        `failures` is what failed when the flow was used, after `compute`.
+        `failures` is what failed when the flow was used, after `compute`. `copies` are more files for the report.
         """
         file = report_file(self.job.output, self.shard)
+        if failures:
+            report["failures"] += failures
+            report.update(status="incomplete", exit_status=1)
         if not report["stopped_by"]:  # a signal leaves no time for this
             report["seconds"] += perf_counter() - self._computed
-            with suppress(OSError):  # the run has reported it
-                write_json(file, report)
+            for path in (file, *copies):
+                with suppress(OSError):  # the run has reported it
+                    write_json(path, report)
         print(f"{format_report(report)}\nflow files in {self.job.output}, report in {file}")
-        status = report["exit_status"] or int(bool(failures))
-        if status:
-            lines = [format_missing(report), *(f"  {name}: {message}" for name, message in failures)]
-            print("\n".join(["missing:", *filter(None, lines)]), file=sys.stderr)
-            what = (
-                f"some frames are missing: see {file}" if report["exit_status"] else "some files could not be written"
-            )
-            end_unfinished(what, status)
+        if report["exit_status"]:
+            print(f"missing:\n{format_missing(report)}", file=sys.stderr)
+            end_unfinished(f"something is missing: see {file}", report["exit_status"])
 
     def _check_output(self) -> None:
         """Make sure that the results may be added to the output."""

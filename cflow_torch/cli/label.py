@@ -14,7 +14,6 @@ from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.cli.flow_run import FlowRun
 from cflow_torch.cli.stored_flow import stored_flow
 from cflow_torch.data.hdf5.writer import check_writable, labelled_by, write_hdf5_labels
-from cflow_torch.data.json_file import write_json
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.machine import choose_devices
@@ -29,7 +28,9 @@ def task(cfg: Label) -> None:
         return
     _check(cfg, run)
     report = run.compute()
-    run.finish(report, [] if report["stopped_by"] else _label(cfg, run, report))
+    failures = [] if report["stopped_by"] else _label(cfg, run, report)
+    file = run.logs.sources[0].parent / f"cflow_label-{run.shard.index}-of-{run.shard.count}.json"
+    run.finish(report, failures, file)
 
 
 def _contents(cfg: Label) -> tuple[str, ...]:
@@ -54,7 +55,10 @@ def _check(cfg: Label, run: FlowRun) -> None:
 
 
 def _label(cfg: Label, run: FlowRun, report: dict[str, Any]) -> Failures:
-    """Label the scenes of a shard whose flow is complete. If one cannot be written, it stays as it was."""
+    """Label the scenes of a shard whose flow is complete, and list them in the report.
+
+    A scene that cannot be written stays as it was.
+    """
     failures: Failures = []
     labelled: list[str] = []
     waiting: list[str] = []
@@ -76,7 +80,5 @@ def _label(cfg: Label, run: FlowRun, report: dict[str, Any]) -> Failures:
             write_hdf5_labels(scene, labels, run.job.identity["hash"], overwrite=run.job.redo)
             labelled.append(scene.name)
     print(f"scenes labelled: {len(labelled)}, scenes without complete flow yet: {len(waiting)}")
-    file = scenes[0].parent / f"cflow_label-{run.shard.index}-of-{run.shard.count}.json"
-    write_json(file, {**report, "labelled": labelled, "waiting": waiting, "not_labelled": failures})
-    print(f"report: {file}")
+    report.update(labelled=labelled, without_flow=waiting)
     return failures

@@ -12,6 +12,7 @@ from small_logs import make_small_drive, write_small_log
 
 from cflow_torch.cli import flow
 from cflow_torch.data.arrays import write_array_log
+from cflow_torch.data.json_file import read_json
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.fleet.progress import show_warnings_as_lines
 
@@ -149,6 +150,9 @@ def test_a_run_whose_tracks_fail_names_them_and_not_its_frames(drives, tmp_path,
     call = ("flow", "data.check=false", drives[0], f"output={tmp_path / 'out'}", "engine.workers=1")
     assert cflow(*call, "model.num_history=0", "model.point_cloud_range=[-9,-9,-inf,9,9,inf]", "tracks=true") == 1
     assert capsys.readouterr().err.endswith("missing:\n  drive_1: no room\n")
+    report = read_json(tmp_path / "out" / "reports" / "shard-0-of-1.json")
+    assert (report["status"], report["exit_status"]) == ("incomplete", 1)
+    assert report["failures"] == [["drive_1", "no room"]] and report["frames"]["failed"] == 0
 
 
 def test_a_run_without_a_frame_claims_nothing(drives, tmp_path, cflow):
