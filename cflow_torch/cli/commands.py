@@ -267,9 +267,10 @@ class Label(FlowFiles):
     Each sweep gets the keys dufo (dynamic), dufocluster, cluster and nnd. It gets ground_mask if it has none. Types and
     meanings are those of OpenSceneFlow's own scripts. First, the command estimates the flow like `cflow flow`, with the
     preset offline, which uses earlier and later sweeps. Then each scene is copied, labelled and replaced, so a killed
-    run leaves the old scene or the new one. Run the command again to resume; labelled scenes are skipped. The report,
-    cflow_label-0-of-1.json, is next to the scenes. You can delete OUTPUT when all scenes are labelled. With shards, the
-    process that completes the flow of a scene labels it. The exit statuses are those of `cflow flow`.
+    run leaves the old scene or the new one. Run the command again to resume, also with overwrite=true: scenes that have
+    the labels of these settings are skipped, and need no flow. So you can delete OUTPUT when all scenes are labelled.
+    The report, cflow_label-0-of-1.json, is next to the scenes. With shards, the process that completes the flow of a
+    scene labels it. The exit statuses are those of `cflow flow`.
 
     examples:
       cflow label /data/scenes/train
@@ -281,6 +282,7 @@ class Label(FlowFiles):
     SUMMARY: ClassVar[str] = "write pseudo-labels for self-supervised training into OpenSceneFlow's scenes"
 
     output: str = _output("outputs/label", "folder for the flow that the labels follow from")
+    overwrite: bool = _overwrite("true = replace labels of other settings or programs, and flow of other settings")
     model: Config = group("offline", kind=Config)
     data: dict[str, Any] = group("hdf5")
 

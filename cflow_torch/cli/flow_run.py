@@ -23,7 +23,7 @@ from cflow_torch.data.log import Log
 from cflow_torch.fleet.executors import Executor
 from cflow_torch.fleet.job import Job, Part, find_shard
 from cflow_torch.fleet.machine import choose_batch, choose_devices, frames_per_worker
-from cflow_torch.fleet.manifest import check_logs, clear_log
+from cflow_torch.fleet.manifest import check_logs, clear_log, is_of_run
 from cflow_torch.fleet.parallel import local_executors
 from cflow_torch.fleet.ray_engine import ray_executors
 from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
@@ -40,9 +40,10 @@ class FlowRun:
     Args:
         cfg: settings of the command.
         contents: the columns of a flow file.
+        redo: compute frames of the same settings again, too.
     """
 
-    def __init__(self, cfg: FlowFiles, contents: Sequence[str]) -> None:
+    def __init__(self, cfg: FlowFiles, contents: Sequence[str], redo: bool) -> None:
         self._cfg = cfg
         self._devices = choose_devices(cfg.device, cfg.engine.workers, os.environ)
         self.logs = find_logs(cfg.data)
@@ -54,14 +55,18 @@ class FlowRun:
             output=str(self.output),
             contents=tuple(contents),
             batch=choose_batch(cfg.engine.batch, self._devices[0]),
-            redo=cfg.overwrite,
+            redo=redo,
         )
+        self.done: frozenset[Any] = frozenset()  # sources of logs that need no flow
         self.shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
 
     @property
     def parts(self) -> list[Part]:
-        """The logs of this shard, or the parts of them that are its own."""
-        return self.shard.parts(self.logs.sources)
+        """The logs of this shard, or the parts of them that are its own, without those that are `done`."""
+        return self._parts()
+
+    def _parts(self, workers: int = 1) -> list[Part]:
+        return [part for part in self.shard.parts(self.logs.sources, workers) if part.source not in self.done]
 
     def open_logs(self) -> Iterator[Log]:
         """Open the logs of this shard one by one, without what takes time."""
@@ -85,10 +90,11 @@ class FlowRun:
         with _ENGINES[name](self.job, devices, **own) as executors:
             if self._cfg.overwrite and self.shard.count == 1:
                 _start(executors[0])
-                for log in self.open_logs():
-                    clear_log(self.output / log.log_id, TRACK_FILES)
+                for folder in (self.output / log.log_id for log in self.open_logs()):
+                    if self.job.redo or not is_of_run(folder, self.job.identity):
+                        clear_log(folder, TRACK_FILES)
             write_config(self._cfg, self.output)
-            parts = self.shard.parts(self.logs.sources, len(devices))
+            parts = self._parts(len(devices))
             about = {"config": settings_record(self._cfg), "versions": versions()}
             report = run_fleet(executors, parts, self.job, devices, self.shard, name, about)
         self._computed = perf_counter()

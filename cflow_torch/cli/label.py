@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
@@ -22,7 +23,8 @@ from cflow_torch.types import CFlowError
 
 
 def task(cfg: Label) -> None:
-    run = FlowRun(cfg, _contents(cfg))
+    run = FlowRun(cfg, _contents(cfg), redo=False)  # the same settings give the same labels
+    run.done = frozenset(scene for scene in run.logs.sources if _maker(scene) == run.job.identity["hash"])
     if cfg.dry_run:
         print(run.forecast())
         return
@@ -46,12 +48,16 @@ def _contents(cfg: Label) -> tuple[str, ...]:
 def _check(cfg: Label, run: FlowRun) -> None:
     for scene in run.logs.sources:
         check_writable(scene)
-        maker = None
-        with suppress(CFlowError):  # a scene that cannot be read is reported later
-            maker = labelled_by(scene)
-        if maker not in (None, run.job.identity["hash"]) and not cfg.overwrite:
+        if _maker(scene) not in (None, run.job.identity["hash"]) and not cfg.overwrite:
             why = "labels of other settings or of another program"
             raise CFlowError(f"{scene} has {why}: give overwrite=true, or label a copy")
+
+
+def _maker(scene: Path) -> str | None:
+    """Return how the labels of a scene were made, None = it has no labels."""
+    with suppress(CFlowError):  # a scene that cannot be read is reported later
+        return labelled_by(scene)
+    return None
 
 
 def _label(cfg: Label, run: FlowRun, report: dict[str, Any]) -> Failures:
@@ -69,7 +75,7 @@ def _label(cfg: Label, run: FlowRun, report: dict[str, Any]) -> Failures:
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
         folder = run.output / scene.stem
         with collect_failures(failures, scene.stem):
-            if labelled_by(scene) == run.job.identity["hash"] and not run.job.redo:
+            if labelled_by(scene) == run.job.identity["hash"]:  # by another shard
                 continue
             log = run.logs.open(scene)
             if not {int(log.timestamps[index]) for index in log.pairs} <= complete_frames(folder):
@@ -77,7 +83,7 @@ def _label(cfg: Label, run: FlowRun, report: dict[str, Any]) -> Failures:
                 continue
             flows = (stored(log, index) for index in log.pairs)
             labels = find_labels(log, flows, model, workers)
-            write_hdf5_labels(scene, labels, run.job.identity["hash"], overwrite=run.job.redo)
+            write_hdf5_labels(scene, labels, run.job.identity["hash"], overwrite=cfg.overwrite)
             labelled.append(scene.name)
     print(f"scenes labelled: {len(labelled)}, scenes without complete flow yet: {len(waiting)}")
     report.update(labelled=labelled, without_flow=waiting)

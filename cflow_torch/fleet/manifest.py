@@ -98,6 +98,11 @@ def claim_log(folder: Path, manifest: Mapping[str, Any]) -> None:
         _check_manifest(folder, _read(folder) or {}, manifest)  # another process may have been quicker
 
 
+def is_of_run(folder: Path, identity: Mapping[str, Any]) -> bool:
+    """Test whether a log's folder has results of the run with this identity."""
+    return (_read(folder) or {}).get("run") == identity
+
+
 def _is_claimed(folder: Path, manifest: Mapping[str, Any]) -> bool:
     """Test whether a folder has a manifest, which must be this one; one of another run without frames is replaced."""
     before = _read(folder)
