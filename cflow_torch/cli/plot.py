@@ -106,8 +106,6 @@ def _truth(cfg: FlowPicture, log: Log, pair: int, result: FlowResult) -> np.ndar
 def _animate(cfg: Animation, model: SceneFlowModel, log: Log, output: Path) -> Path:
     """Estimate the flow of several pairs, then draw them. Nothing is written if one of them fails."""
     pairs = chosen_pairs(log, cfg.data, cfg.count)
-    if not pairs:
-        raise CFlowError(f"data.first={cfg.data['first']}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
     ensure_writable(output)
     seconds = log.sweep_times(model.config.sweep_interval)
     frames: list[AnimatedPair] = []

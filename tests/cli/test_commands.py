@@ -121,6 +121,15 @@ def test_the_results_file_is_complete(log_folder, tmp_path, evaluate):
     assert results_of(tmp_path)["data"]["digest"] != record["data"]["digest"], "of what was scored"
 
 
+def test_pairs_without_labels_are_not_estimated(tmp_path, evaluate, monkeypatch, capsys):
+    labels, windows, read = AV2Log._labels, [], pairs.window
+    monkeypatch.setattr(AV2Log, "_labels", lambda log, index: labels(log, index) if index == 1 else None)
+    monkeypatch.setattr(pairs, "window", lambda log, index, *rest: (windows.append(index), read(log, index, *rest))[1])
+    assert evaluate() == 0 and results_of(tmp_path)["num_pairs"] == 1 and windows == [1]
+    assert evaluate("data.first=9", "overwrite=true") == 2
+    assert "no pair could be scored" in (error := capsys.readouterr().err) and "has pairs 0 to 2" in error
+
+
 def test_a_folder_of_another_run_is_an_error_that_names_the_difference(tmp_path, evaluate, capsys):
     file = tmp_path / "results.json"
     assert evaluate("data.step=3") == 0
