@@ -27,6 +27,8 @@ from cflow_torch.fleet.changes import check_same_run, nearest_preset
 from cflow_torch.types import CFlowError
 
 _CONFIG = "config.yaml"
+_OF_CALL = ("row", "experiment", "shard", "dry_run", "overwrite")
+_DEFAULTS = {"defaults": ["hydra", "_self_"]}  # so that our settings of Hydra also hold for `--config-name config`
 
 
 def versions() -> dict[str, str]:
@@ -73,14 +75,15 @@ def local_folder(cfg: Command) -> Path:
 
 
 def settings_record(cfg: Command) -> dict[str, Any]:
-    """Return the settings of a run for YAML and JSON; the command reads them again."""
-    return {name: value for name, value in asdict(cfg).items() if name not in ("row", "experiment")}
+    """Return the settings of a run for YAML and JSON, without those of a single call; the command reads them again."""
+    return {name: value for name, value in asdict(cfg).items() if name not in _OF_CALL}
 
 
 def write_config(cfg: Command, folder: Path) -> None:
     """Write the settings and versions to `folder/config.yaml`, in place of those of an earlier run only."""
     read_config(folder)
-    write_text(folder / _CONFIG, OmegaConf.to_yaml(OmegaConf.create({**settings_record(cfg), "versions": versions()})))
+    config = {**_DEFAULTS, **settings_record(cfg), "versions": versions()}
+    write_text(folder / _CONFIG, OmegaConf.to_yaml(OmegaConf.create(config)))
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -92,6 +95,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     with suppress(Exception):  # whatever a file of others holds
         config: Any = OmegaConf.to_container(OmegaConf.create(content.decode("utf-8")))
         if "cflow_torch" in config["versions"]:
+            config.pop("defaults", None)
             return config  # type: ignore[no-any-return]
     raise CFlowError(f"{file} is not a record of cflow, and we do not replace it: give output=FOLDER")
 

@@ -42,8 +42,9 @@ def evaluate(cflow: Callable[..., int], log_folder: Path, tmp_path: Path) -> Cal
     return lambda *arguments: cflow(*call, *arguments)
 
 
-def test_demo_writes_all_its_files(tmp_path, cache, cflow, capsys):
+def test_demo_writes_all_its_files(tmp_path, cache, cflow, capsys, monkeypatch):
     pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
     assert cflow("demo", f"output={tmp_path}", "data.num_sweeps=2", "pair=0", "model.num_history=0", SMALL) == 0
     (log,) = (AV2Log(folder) for folder in cache.glob("*-2/*/*"))
     assert [file.stem for file in (tmp_path / log.log_id).iterdir()] == [str(log.timestamps[0])]
@@ -63,6 +64,7 @@ def test_demo_writes_all_its_files(tmp_path, cache, cflow, capsys):
     again = tmp_path / "again"
     assert cflow("demo", "--config-dir", tmp_path, "--config-name", "config", f"output={again}") == 0
     assert results_of(again)["results"] == scores["results"]
+    assert not (tmp_path / "outputs").exists() and not list(tmp_path.glob("*.log")), "Hydra writes no files"
     if find_spec("k3d"):
         assert (again / "flow.html").read_bytes() == (tmp_path / "flow.html").read_bytes()
 

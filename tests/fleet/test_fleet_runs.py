@@ -171,6 +171,7 @@ def test_a_sweep_over_shards_shares_one_folder(fleet, single_run, tmp_path):
     assert command("-m", f"data.root={fleet}", f"output={tmp_path}", "shard.count=2", "shard.index=0,1") == 0
     reports = [json.loads(file.read_text()) for file in sorted((tmp_path / "reports").iterdir())]
     assert [report["exit_status"] for report in reports] == [0, 0]
+    assert "\nshard:" not in (tmp_path / "config.yaml").read_text(), "a run of this file computes all frames"
     assert flow_files(tmp_path) == flow_files(single_run)
 
 
