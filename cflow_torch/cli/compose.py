@@ -8,6 +8,8 @@ import traceback
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Iterator
 
 import hydra
@@ -85,14 +87,17 @@ def run_with_hydra(name: str, overrides: list[str], options: list[str]) -> None:
             keep_freed_memory()
             return import_module(f"cflow_torch.cli.{name}").task(settings)
 
-    with errors_told(name):
+    with errors_told(name), TemporaryDirectory() as folder:
         # A job's folder is named after the swept settings, and after experiment and data.label if they are given.
         parsed = _PARSER.parse_overrides(overrides)
         fixed = {str(one.key_or_group) for one in parsed if not one.is_sweep_override()}
         unnamed = {"output", "overwrite", *fixed} - {"experiment", "data.label"}
         names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(sorted(unnamed))}]"
+        # Hydra, its sweepers and launchers write their own files to OUTPUT. They know no object stores.
+        is_remote = any(one.key_or_group == "output" and "://" in str(one.value()) for one in parsed)
+        dirs = [f'hydra.sweep.dir="{Path(folder).as_posix()}"'] if is_remote else []
         os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
-        sys.argv = [f"cflow {name}", *overrides, names, *options]
+        sys.argv = [f"cflow {name}", *dirs, *overrides, names, *options]
         job()
 
 

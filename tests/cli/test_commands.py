@@ -98,6 +98,13 @@ def test_the_page_and_the_picture_of_a_demo_show_the_first_log(log_folder, tmp_p
     assert results_of(tmp_path / "out")["num_pairs"] == 6
 
 
+def test_a_sweep_writes_to_an_object_store(tmp_path, evaluate, monkeypatch, capsys):
+    pytest.importorskip("upath")
+    monkeypatch.chdir(tmp_path)
+    assert evaluate("-m", "data.step=3,4", "output=memory://swept") == 0 and not list(tmp_path.iterdir())
+    assert "also in memory://swept/comparison.csv" in capsys.readouterr().out
+
+
 def test_demo_and_submit_write_to_this_machine(log_folder, cflow, capsys):
     pytest.importorskip("upath")
     for call in (["demo"], ["submit", log_folder]):
