@@ -23,7 +23,6 @@ from cflow_torch.cli.outputs import (
     output_folder,
     read_config,
     settings_record,
-    versions,
     write_config,
 )
 from cflow_torch.cli.pairs import for_each_pair
@@ -34,7 +33,7 @@ from cflow_torch.estimate import make_model
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
-from cflow_torch.fleet.manifest import are_of_same_log, describe_log
+from cflow_torch.fleet.manifest import are_of_same_log, describe_log, versions
 from cflow_torch.simulator.benchmark import generator_key
 from cflow_torch.stages import CallTime, time_report
 from cflow_torch.types import CFlowError, FlowResult, Window

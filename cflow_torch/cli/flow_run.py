@@ -14,7 +14,7 @@ from typing import Any, Callable, Iterator, Sequence
 from cflow_torch.cli.commands import FlowFiles
 from cflow_torch.cli.failures import Failures, end_unfinished
 from cflow_torch.cli.logs import find_logs
-from cflow_torch.cli.outputs import output_folder, read_config, settings_record, versions, write_config
+from cflow_torch.cli.outputs import output_folder, read_config, settings_record, write_config
 from cflow_torch.cli.track_formats import TRACK_FILES
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.catalog import source_name
@@ -23,7 +23,7 @@ from cflow_torch.data.log import Log
 from cflow_torch.fleet.executors import Executor
 from cflow_torch.fleet.job import Job, Part, find_shard
 from cflow_torch.fleet.machine import choose_batch, choose_devices, frames_per_worker
-from cflow_torch.fleet.manifest import check_logs, clear_log, is_of_run
+from cflow_torch.fleet.manifest import check_logs, clear_log, is_of_run, versions
 from cflow_torch.fleet.parallel import local_executors
 from cflow_torch.fleet.ray_engine import ray_executors
 from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet

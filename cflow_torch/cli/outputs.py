@@ -10,12 +10,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Sequence
 
-import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from cflow_torch import __version__
 from cflow_torch.cli.choices import free_names
 from cflow_torch.cli.commands import Command, Submit
 from cflow_torch.cli.failures import is_sweep
@@ -24,6 +22,7 @@ from cflow_torch.data.atomic import ensure_writable, write_text
 from cflow_torch.data.json_file import json_ready
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.changes import check_same_run, nearest_preset
+from cflow_torch.fleet.manifest import versions
 from cflow_torch.types import CFlowError
 
 _CONFIG = "config.yaml"
@@ -31,18 +30,11 @@ _OF_CALL = ("row", "experiment", "shard", "dry_run", "overwrite")
 _DEFAULTS = {"defaults": ["hydra", "_self_"]}  # so that our settings of Hydra also hold for `--config-name config`
 
 
-def versions() -> dict[str, str]:
-    return {
-        "cflow_torch": __version__,
-        "torch": str(torch.__version__),
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-    }
-
-
 def machine() -> dict[str, Any]:
-    """Describe the machine, on which times depend: "platform", "cpu", "cores", "threads" (of torch)."""
+    """Describe the machine: "platform", "cpu", "cores", "threads" (of torch), "torch" (its build), "python"."""
     return {
+        "torch": str(torch.__version__),
+        "python": platform.python_version(),
         "platform": platform.platform(),
         "cpu": processor(),
         "cores": os.cpu_count(),

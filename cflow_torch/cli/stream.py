@@ -11,10 +11,11 @@ from tqdm import tqdm
 from cflow_torch.applications.stream import FlowStream
 from cflow_torch.cli.commands import Stream
 from cflow_torch.cli.logs import open_first_log
-from cflow_torch.cli.outputs import machine, output_folder, versions
+from cflow_torch.cli.outputs import machine, output_folder
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
+from cflow_torch.fleet.manifest import versions
 
 
 def task(cfg: Stream) -> None:

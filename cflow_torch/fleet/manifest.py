@@ -41,23 +41,24 @@ _OURS = re.compile(r"[0-9]+\.feather|manifest\.json|\..+\.tmp")
 _LABELS = re.compile(r"[0-9]{6}\.label|\..+\.tmp")
 
 
-def make_identity(
-    config: Config, reader: str, settings: Mapping[str, Any], contents: Sequence[str] = CONTENTS
-) -> dict[str, Any]:
-    """Return what determines a result besides the sweeps: method, data settings, contents of files, versions.
-
-    CPU and CUDA builds of one torch version count as the same.
-    """
-    versions = {
+def versions() -> dict[str, str]:
+    """Return the versions on which results depend. CPU and CUDA builds of one torch version count as the same."""
+    return {
         "cflow_torch": __version__,
         "torch": str(torch.__version__).split("+")[0],
         "numpy": np.__version__,
     }
+
+
+def make_identity(
+    config: Config, reader: str, settings: Mapping[str, Any], contents: Sequence[str] = CONTENTS
+) -> dict[str, Any]:
+    """Return what determines a result besides the sweeps: method, data settings, contents of files, versions."""
     data = {"reader": reader, **{key: value for key, value in settings.items() if key != "check"}}
     free = free_settings(type(config))
     method = {key: value for key, value in asdict(config).items() if key not in free}
     identity = json_ready(
-        {"format": _FORMAT, "method": method, "data": data, "contents": contents, "versions": versions}
+        {"format": _FORMAT, "method": method, "data": data, "contents": contents, "versions": versions()}
     )
     text = json.dumps(identity, indent=1, sort_keys=True) + "\n"
     return {**identity, "hash": hashlib.sha256(text.encode()).hexdigest()}
