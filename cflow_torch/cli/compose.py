@@ -26,7 +26,7 @@ from cflow_torch.cli.words import check_exists
 from cflow_torch.config import PRESETS
 from cflow_torch.errors import CFlowError
 from cflow_torch.fleet.progress import show_warnings_as_lines
-from cflow_torch.setting import Settings
+from cflow_torch.setting import AUTO, Settings
 
 _PARSER = OverridesParser.create()
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
@@ -113,7 +113,7 @@ def _complete(settings: Command) -> dict[str, Any]:
                 sys.path.append(source.path)
         return {"label": str(HydraConfig.get().runtime.choices.get("data")), "first": 0, "step": 1, **data}
     root = data.get("root")
-    if root == NOT_GIVEN:
+    if root in (NOT_GIVEN, []) or (root is None and "root" in data and data["name"] != AUTO):
         raise CFlowError("the data is missing: give data.root=PATH, or only the path")
     for path in root if isinstance(root, list) else [root]:
         if isinstance(path, str):
