@@ -512,7 +512,7 @@ class Stream(Command):
         1.0, "factor on the speed of the recording; null = as fast as possible", optional=True
     )
     max_gap: float = setting(0.5, "seconds; sweeps with a longer gap between them are not compared")
-    count: int | None = _count(None, "number of sweeps; null = all")
+    count: int | None = setting(None, "number of sweeps; null = all", kind=int, low=2)
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,7 @@ CHEAP = (
     ("plot truth=maybe", "truth='maybe': give one of True, False, 'auto'"),
     ("view format=pdf", "format='pdf': give one of 'html', 'rerun'"),
     ("flow shard.index=one shard.count=3", "shard.index='one': give a whole number of at least 0"),
+    ("stream count=1", "count=1: give a whole number of at least 2"),
     ("flow engine.workers=0", "engine.workers=0: give a whole number of at least 1"),
     ("flow engine.memory=true", "engine.memory=True: give a number above 0"),
     ("eval +model.thorough=1", "unknown setting thorough: the fields are method"),
