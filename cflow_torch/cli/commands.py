@@ -377,7 +377,10 @@ class Plot(Command):
         False, "true = draw moving objects where they were at the time of the sweep (by point times)"
     )
     pair: int | None = setting(
-        None, "index of the pair in the log, from 0; null = 3, or the last pair of a shorter log", kind=int, low=0
+        None,
+        "index of the pair in the log, from 0; null = the fourth pair, or the last one of a shorter log",
+        kind=int,
+        low=0,
     )
     picture: str = group("flow")
 

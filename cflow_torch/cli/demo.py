@@ -49,7 +49,7 @@ def task(cfg: Demo) -> None:
 
     for log in logs:
         remove_stale(output / log.log_id)
-    pairs = [(log, index) for log in logs for index in range(len(log.timestamps) - 1)]
+    pairs = [(log, index) for log in logs for index in log.pairs]
     times: list[CallTime] = []
     failures += for_each_pair(pairs, model, keep, times)
     scores.report(output, logs, time_report(times), failures)

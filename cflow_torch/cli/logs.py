@@ -59,10 +59,10 @@ def chosen_pairs(log: Log, data: Mapping[str, Any], count: int | None = None) ->
 
 
 def check_pair(pair: int, log: Log) -> None:
-    """Reject the index of a pair that the log does not have."""
-    last = len(log.timestamps) - 2
-    if not 0 <= pair <= last:
-        raise CFlowError(f"pair={pair}: log {log.log_id} has pairs 0 to {last}")
+    """Reject the index of a pair that the log does not have, or that reaches over a gap."""
+    if pair not in log.pairs:
+        gaps = f", without {', '.join(map(str, sorted(log.gaps)))} (gaps)" if log.gaps else ""
+        raise CFlowError(f"pair={pair}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}{gaps}")
 
 
 def find_logs(data: dict[str, Any]) -> Logs:

@@ -40,8 +40,8 @@ def task(cfg: Plot) -> None:
     if isinstance(cfg, Animation):
         path = _animate(cfg, model, log, output)
     else:
-        last = len(log.timestamps) - 2
-        pair = min(3, last) if cfg.pair is None else cfg.pair  # some history precedes it
+        fourth = (log.pairs[:4] or [0])[-1]  # some history precedes it
+        pair = fourth if cfg.pair is None else cfg.pair
         check_pair(pair, log)
         sweeps = window(log, pair, model.config.num_history, model.config.num_future)
         ensure_writable(output)

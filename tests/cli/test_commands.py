@@ -81,7 +81,7 @@ def test_demo_without_the_extras_lacks_only_picture_and_page(tmp_path, cflow, mo
     assert "no page (" in printed.out and "k3d" in printed.out
 
 
-def test_the_page_and_the_picture_of_a_demo_show_the_first_log(log_folder, tmp_path, cflow, monkeypatch):
+def test_the_page_and_the_picture_of_a_demo_show_the_first_log(log_folder, tmp_path, cflow, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     for name in ("a", "b"):
         shutil.copytree(log_folder, tmp_path / "logs" / name)
@@ -93,10 +93,13 @@ def test_the_page_and_the_picture_of_a_demo_show_the_first_log(log_folder, tmp_p
     monkeypatch.setattr(
         demo, "plot_flow", lambda *given, title, **view: (titles.append(title), plot(*given, **view))[1]
     )
+    monkeypatch.setattr(AV2Log, "gaps", frozenset({2}))
     data = ("data=av2", f"data.root={tmp_path / 'logs'}", "data.check=false")
-    assert cflow("demo", *data, f"output={tmp_path / 'out'}", "pair=1", "model=paper", SMALL) == 0
-    assert pages == [("a", 3)] and titles == ["CorrelationFlow, a"]
-    assert results_of(tmp_path / "out")["num_pairs"] == 6
+    call = ("demo", *data, f"output={tmp_path / 'out'}", "model=paper", SMALL)
+    assert cflow(*call, "pair=2") == 2 and "has pairs 0 to 2, without 2 (gaps)" in capsys.readouterr().err
+    assert cflow(*call, "pair=1") == 0
+    assert pages == [("a", 2)] and titles == ["CorrelationFlow, a"]
+    assert results_of(tmp_path / "out")["num_pairs"] == 4, "of two logs, without the pairs over their gaps"
 
 
 def test_a_sweep_writes_to_an_object_store(tmp_path, evaluate, monkeypatch, capsys):
