@@ -78,7 +78,8 @@ def run_with_hydra(name: str, overrides: list[str], options: list[str]) -> None:
     def job(composed: Any) -> Any:
         with errors_told(name):
             values: Any = OmegaConf.to_container(composed, resolve=True)
-            values.pop("versions", None)  # of the config.yaml of an earlier run
+            for name_of_record in ("command", "versions"):  # in the config.yaml of an earlier run
+                values.pop(name_of_record, None)
             settings = WITH_SETTINGS[name].of(values)  # checks the values, before torch is imported
             show_warnings_as_lines()
             settings = replace(settings, data=_complete(settings))

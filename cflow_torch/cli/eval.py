@@ -55,7 +55,7 @@ def task(cfg: Eval) -> float:
             finish(failures)
         return objective(record["results"])
     model = make_model(cfg.model, cfg.device)
-    read_config(ensure_writable(output))  # one of others fails now, not after the work
+    read_config(cfg, ensure_writable(output))  # one of others fails now, not after the work
     pairs: list[tuple[Log, int]] = []
     for log in logs:
         with collect_failures(failures, log.log_id):

@@ -81,7 +81,7 @@ class FlowRun:
 
     def compute(self) -> dict[str, Any]:
         """Write the flow files of this shard, and return the report of `run_fleet`."""
-        read_config(ensure_writable(self.output))  # one of others fails now, not when logs are cleared
+        read_config(self._cfg, ensure_writable(self.output))  # one of others fails now, not when logs are cleared
         self._check_output()
         devices = self._useful_devices()
         settings = asdict(self._cfg.engine)

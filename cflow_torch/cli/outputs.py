@@ -15,7 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from cflow_torch.cli.choices import free_names
-from cflow_torch.cli.commands import Command, Submit
+from cflow_torch.cli.commands import WITH_SETTINGS, Command, Submit
 from cflow_torch.cli.failures import is_sweep
 from cflow_torch.cli.info import processor
 from cflow_torch.data.atomic import ensure_writable, write_text
@@ -73,13 +73,20 @@ def settings_record(cfg: Command) -> dict[str, Any]:
 
 def write_config(cfg: Command, folder: Path) -> None:
     """Write the settings and versions to `folder/config.yaml`, in place of those of an earlier run only."""
-    read_config(folder)
-    config = {**_DEFAULTS, **settings_record(cfg), "versions": versions()}
+    read_config(cfg, folder)
+    config = {**_DEFAULTS, "command": _command(cfg), **settings_record(cfg), "versions": versions()}
     write_text(folder / _CONFIG, OmegaConf.to_yaml(OmegaConf.create(config)))
 
 
-def read_config(folder: Path) -> dict[str, Any]:
-    """Read the settings and versions of an earlier run; {} = there are none. A file of others is a `CFlowError`."""
+def _command(cfg: Command) -> str:
+    return next(name for name, kind in WITH_SETTINGS.items() if isinstance(cfg, kind))
+
+
+def read_config(cfg: Command, folder: Path) -> dict[str, Any]:
+    """Read the settings and versions of an earlier run of this command; {} = there are none.
+
+    A file of another command, or of others, is a `CFlowError`.
+    """
     file = folder / _CONFIG
     if not file.exists():
         return {}
@@ -88,8 +95,9 @@ def read_config(folder: Path) -> dict[str, Any]:
         config: Any = OmegaConf.to_container(OmegaConf.create(content.decode("utf-8")))
         if "cflow_torch" in config["versions"]:
             config.pop("defaults", None)
-            return config  # type: ignore[no-any-return]
-    raise CFlowError(f"{file} is not a record of cflow, and we do not replace it: give output=FOLDER")
+            if config.pop("command", _command(cfg)) == _command(cfg):
+                return config  # type: ignore[no-any-return]
+    raise CFlowError(f"{file} is not a record of `cflow {_command(cfg)}`, and we do not replace it: give output=FOLDER")
 
 
 def made_by(cfg: Command, **more: Any) -> dict[str, Any]:
@@ -110,7 +118,7 @@ def claim_output(cfg: Submit, folder: Path, results: Sequence[Path]) -> None:
 
     With `cfg.overwrite`, we remove older results, but not what is not ours.
     """
-    before = read_config(ensure_writable(folder))
+    before = read_config(cfg, ensure_writable(folder))
     for path in results:
         if path.exists() and not before:
             raise CFlowError(f"{path} exists and is not a result of `cflow submit`: give output=FOLDER")

@@ -123,13 +123,13 @@ def test_clean_removes_nothing_that_it_has_not_written(tmp_path, cflow, capsys):
 
 
 @pytest.mark.parametrize("command", ["flow", "clean", "eval"])
-@pytest.mark.parametrize("content", ["name: mine\n", "{", "- 1\n"])
-def test_a_config_of_another_program_is_not_replaced(command, content, drives, tmp_path, cflow, capsys):
+@pytest.mark.parametrize("content", ["name: mine\n", "{", "- 1\n", "command: demo\nversions: {cflow_torch: 1}\n"])
+def test_a_config_of_another_program_or_command_is_not_replaced(command, content, drives, tmp_path, cflow, capsys):
     config = tmp_path / "out" / "config.yaml"
     config.parent.mkdir()
     config.write_text(content)
     assert cflow(command, *SMALL, drives[0], f"output={config.parent}", "overwrite=true") == 2
-    assert "is not a record of cflow" in capsys.readouterr().err and config.read_text() == content
+    assert f"is not a record of `cflow {command}`" in capsys.readouterr().err and config.read_text() == content
 
 
 def test_clean_names_a_second_log_of_a_name(drives, tmp_path, cflow, capsys):
