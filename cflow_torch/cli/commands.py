@@ -96,9 +96,11 @@ class Local(Engine):
     """Worker processes of this machine."""
 
     name: str = setting("local", "the engine; engine= chooses it", choices=("local",))
-    timeout: float = _above_0(600, "seconds for a frame after which a silent worker is replaced (with several workers)")
+    timeout: float = _above_0(
+        600, "seconds without a finished batch after which a worker is replaced (with several workers)"
+    )
     memory: float | None = _above_0(
-        None, "limit of the address space of each worker on a CPU, in bytes, for example 8e9; null = no limit"
+        None, "limit of the address space of each worker on a CPU, in bytes, such as 8e9; null = none; not on Windows"
     )
 
 
