@@ -368,16 +368,12 @@ class Plot(Command):
 
     SUMMARY: ClassVar[str] = "draw flow, clusters, key points, correlation, scales or an animation"
     NAMED_BY: ClassVar[str] = "picture"
-    CHOOSES_PAIRS: ClassVar[bool] = True  # of an animation
     PRESET: ClassVar[str] = ""  # that the picture chooses, "" = none
     PIXEL_SIZES: ClassVar[tuple[float, ...]] = ()  # that the picture chooses
 
     output: str = _output("outputs/plot", "local folder; the file is named after the picture")
     device: str = _device()
     log: str | None = _path("id of the log; null = the first one")
-    deskew: bool = setting(
-        False, "true = draw moving objects where they were at the time of the sweep (by point times)"
-    )
     pair: int | None = setting(
         None,
         "index of the pair in the log, from 0; null = the fourth pair, or the last one of a shorter log",
@@ -392,7 +388,16 @@ class Plot(Command):
 
 
 @dataclass(frozen=True)
-class FlowPicture(Plot):
+class FromAbove(Plot):
+    """The points of sweep t from above."""
+
+    deskew: bool = setting(
+        False, "true = draw moving objects where they were at the time of the sweep (by point times)"
+    )
+
+
+@dataclass(frozen=True)
+class FlowPicture(FromAbove):
     """The flow from above. If the log has labels, the truth and the error are drawn next to it."""
 
     truth: bool | str = setting(
@@ -402,7 +407,7 @@ class FlowPicture(Plot):
 
 
 @dataclass(frozen=True)
-class ClustersPicture(Plot):
+class ClustersPicture(FromAbove):
     """The points of sweep t coloured by cluster.
 
     With model=paper those that are correlated, with model=default those that were selected.
@@ -441,6 +446,8 @@ class ScalesPicture(CorrelationPicture):
 @dataclass(frozen=True)
 class Animation(Plot):
     """The flow of several pairs, one after the other, with the same view and colours. `pair` is ignored."""
+
+    CHOOSES_PAIRS: ClassVar[bool] = True
 
     count: int | None = _count(None, "number of pairs, from data.first, every data.step; null = to the end of the log")
     format: str = setting("gif", "gif | mp4 (extra video)", choices=("gif", "mp4"))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from cflow_torch.cli.commands import Animation, CorrelationPicture, FlowPicture, Plot
+from cflow_torch.cli.commands import Animation, CorrelationPicture, FlowPicture, FromAbove, Plot
 from cflow_torch.cli.failures import finish
 from cflow_torch.cli.logs import check_pair, chosen_pairs, find_logs, paths_of
 from cflow_torch.cli.outputs import chosen_preset, local_folder
@@ -73,12 +73,12 @@ def _draw(cfg: Plot, model: SceneFlowModel, log: Log, pair: int, sweeps: Window)
     if isinstance(cfg, CorrelationPicture):
         draw = plot_scales if cfg.picture == "scales" else plot_correlation
         return draw(sweeps, model.config, cluster_id=cfg.cluster)
-    if cfg.picture == "keypoints":
-        return plot_keypoints(sweeps, model.config)
-    return _from_above(cfg, model, log, pair, sweeps)
+    if isinstance(cfg, FromAbove):
+        return _from_above(cfg, model, log, pair, sweeps)
+    return plot_keypoints(sweeps, model.config)
 
 
-def _from_above(cfg: Plot, model: SceneFlowModel, log: Log, pair: int, sweeps: Window) -> Any:
+def _from_above(cfg: FromAbove, model: SceneFlowModel, log: Log, pair: int, sweeps: Window) -> Any:
     points, (result,) = sweeps.pc0.points, model([sweeps])
     if cfg.deskew:
         points = deskew_objects(sweeps, result, model.config.sweep_interval).cpu()

@@ -88,9 +88,11 @@ def _check_settings(settings: list[str], command: str, has_own: bool) -> None:
         if key not in known:
             hint = _group_of(value, chosen) or near(key, [*chosen, *known])
             raise CFlowError(f"unknown setting {key!r}{hint}: `cflow {command} --cfg job` prints all settings")
-        if key in PAIR_SETTINGS and not kind.CHOOSES_PAIRS:
-            choosing = [name for name, other in WITH_SETTINGS.items() if other.CHOOSES_PAIRS]
-            raise CFlowError(f"{key} is for cflow {' and cflow '.join(choosing)}: cflow {command} takes every pair")
+        kinds: list[type[Command]] = [kind]
+        if "picture" in chosen:
+            kinds = [PICTURES[name] for name in chosen["picture"] or PICTURES]
+        if key in PAIR_SETTINGS and not any(each.CHOOSES_PAIRS for each in kinds):
+            raise CFlowError(f"{key} is for cflow eval, cflow view and cflow plot picture=animation: leave it out")
         _check_value(key, value, known[key], chosen)
 
 

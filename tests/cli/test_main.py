@@ -68,7 +68,12 @@ CHEAP = (
     ("eval model.pixel_sizes=[0.2", "cannot read 'model.pixel_sizes=[0.2'"),
     ("eval model.method=dense", "is a setting of method verified"),
     ("eval data.step=0", "data.step=0: give a whole number of at least 1"),
-    ("flow data.first=6", "data.first is for cflow eval and cflow plot and cflow view: cflow flow takes every pair"),
+    ("flow data.first=6", "data.first is for cflow eval, cflow view and cflow plot picture=animation: leave it out"),
+    ("plot data.first=1", "data.first is for cflow eval, cflow view and cflow plot picture=animation"),
+    (
+        "plot picture=correlation deskew=true",
+        "setting 'deskew' belongs to picture=clusters or picture=flow: give that as well",
+    ),
     ("eval overwrite=maybe", "overwrite='maybe': give True or False"),
     ("bench batches=[0]", "batches=0: give a whole number of at least 1"),
     ("plot picture=animation width=abc", "width='abc': give a whole number of at least 1"),
