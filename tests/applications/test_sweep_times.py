@@ -27,7 +27,8 @@ from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.log import CachedLog, TimedLog
 
 STEP = 0.9  # metres per sweep
-SMALL = ("model.num_history=0", "model.pixel_sizes=[0.4,0.2]", "data.check=false", "engine.workers=1")
+NEAR = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
+SMALL = ("model.num_history=0", "model.pixel_sizes=[0.4,0.2]", NEAR, "data.check=false", "engine.workers=1")
 
 
 class Numbered(Staged):

@@ -177,6 +177,7 @@ FLAGS = [  # software rendering, and no calls home
     *("--disable-background-networking", "--disable-component-update"),
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
 ]
+SIZE = {"width": 720, "height": 480}  # rendering by software takes time for each pixel
 
 
 @pytest.fixture(scope="module")
@@ -233,7 +234,7 @@ def count_of(pixels: np.ndarray, colors: np.ndarray) -> int:
 
 
 def test_a_browser_shows_plays_recolours_and_cleans_a_drive(browser: Any, drive_page: Path) -> None:
-    context = browser.new_context(viewport={"width": 720, "height": 480}, color_scheme="dark")
+    context = browser.new_context(viewport=SIZE, color_scheme="dark")
     tab, requests, errors = context.new_page(), [], []
     tab.on("request", lambda request: requests.append(request.url))
     tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
@@ -466,7 +467,7 @@ def test_every_key_and_control_does_what_it_says(browser: Any, drive_page: Path)
 
 
 def test_a_notebook_shows_the_page_inline(browser: Any, tmp_path: Path) -> None:
-    tab = browser.new_page()
+    tab = browser.new_page(viewport=SIZE)
     (tmp_path / "cell.html").write_text(show(window(Street(), 0), result_of())._repr_html_(), encoding="utf-8")
     tab.goto((tmp_path / "cell.html").as_uri())
     tab.frame_locator("iframe").locator("#now:has-text('sweep 0 of 0')").wait_for(timeout=60_000)
@@ -474,7 +475,7 @@ def test_a_notebook_shows_the_page_inline(browser: Any, tmp_path: Path) -> None:
 
 
 def test_keys_stay_with_the_control_that_has_the_focus(browser: Any, drive_page: Path) -> None:
-    tab = browser.new_page()
+    tab = browser.new_page(viewport=SIZE)
     tab.goto(drive_page.as_uri())
     tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
     for name, value in (("#show-rings", "rings"), ("#show-labels", "labels")):
@@ -512,7 +513,7 @@ def test_a_page_of_every_fifth_pair_has_the_pace_of_the_drive_and_the_sweep_of_i
     late = min(ids[0] & ids[1])
     data["frames"][0]["boxes"] = [box for box in data["frames"][0]["boxes"] if box["id"] != late]
     (tmp_path / "page.html").write_text(text.replace(script, json.dumps(data)), encoding="utf-8")
-    tab = browser.new_page()
+    tab = browser.new_page(viewport=SIZE)
     pauses = []
     for address in (drive_page.as_uri(), f"{(tmp_path / 'page.html').as_uri()}#sweep=0&object={late}"):
         tab.goto(address)
