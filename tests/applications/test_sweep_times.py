@@ -83,9 +83,10 @@ def test_pairs_far_apart_confirm_a_track_and_a_long_pause_ends_it() -> None:
     log = Staged([straight((0, 0), (0.5, 0.0), 40)])
     pairs = [(index, log.result(index)) for index in range(0, 39, 4)]
     assert len(set(track(log, pairs)["id"])) == 1
-    late = Staged([straight((0, 0), (0.1, 0.0), 60)])
-    assert len(set(track(late, [pair for pair in late.results() if not 20 <= pair[0] < 28])["id"])) == 1
-    assert len(set(track(late, [pair for pair in late.results() if not 20 <= pair[0] < 40])["id"])) == 2
+    late = Staged([straight((0, 0), (0.1, 0.0), 48)])
+    results = list(late.results())
+    assert len(set(track(late, [pair for pair in results if not 20 <= pair[0] < 28])["id"])) == 1
+    assert len(set(track(late, [pair for pair in results if not 20 <= pair[0] < 40])["id"])) == 2
 
 
 def test_the_pair_over_a_gap_is_not_estimated(monkeypatch: pytest.MonkeyPatch) -> None:
