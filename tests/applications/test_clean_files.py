@@ -20,6 +20,7 @@ from cflow_torch.applications.cleaning import MaskedLog, static_map_with_intensi
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, copy_rows, read_cloud, write_cloud
 
+FAST = ("model.num_history=0", "model.pixel_sizes=[0.4,0.2]")
 DRIVE = Staged([straight((1, 1), (0.9, 0.0), 4)])
 NAMES = [f"scan_{1700000000 + index}.{index}00" for index in range(4)]  # seconds with decimals
 
@@ -207,7 +208,7 @@ def test_the_command_counts_what_it_removes_and_writes_a_map_that_is_missing(
 ) -> None:
     write_drive(tmp_path / "drive", ".npy")
     np.savetxt(tmp_path / "drive" / "poses.txt", np.tile(np.eye(4)[:3].reshape(12), (4, 1)))
-    more = ("model.num_history=0", "map=true", "voxel_size=0.4", "data.find_ground=null", "data.check=false")
+    more = (*FAST, "map=true", "voxel_size=0.4", "data.find_ground=null", "data.check=false")
     for expected in ("removed {:,} of {:,} points", "it is complete"):
         assert cflow("clean", tmp_path / "drive", f"output={tmp_path / 'clean'}", "suffix=.bin", *more) == 0
         masks = [np.load(file) for file in (tmp_path / "clean" / "drive" / "removed").iterdir()]
@@ -233,7 +234,7 @@ def test_clean_clouds_of_an_earlier_flow_are_not_taken_for_complete(
     write_drive(tmp_path / "drive", ".npy")
     np.savetxt(tmp_path / "drive" / "poses.txt", np.tile(np.eye(4)[:3].reshape(12), (4, 1)))
     data = (tmp_path / "drive", "data.find_ground=null", "data.check=false")
-    flow = ("flow", *data, f"output={tmp_path / 'flow'}", "model.num_history=0")
+    flow = ("flow", *data, f"output={tmp_path / 'flow'}", *FAST)
     clean = ("clean", *data, f"output={tmp_path / 'clean'}", f"flow={tmp_path / 'flow'}")
     assert cflow(*flow) == 0 and cflow(*clean) == 0 and cflow(*clean) == 0
     assert "it is complete" in capsys.readouterr().out
