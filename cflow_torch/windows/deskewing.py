@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from cflow_torch.ops.indices import divide
-from cflow_torch.tensors import read_positions
+from cflow_torch.tensors import float64_tensor, read_positions
 from cflow_torch.transforms import relative_transform, rigid_transform
 from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy, check_array, point_rows
 from cflow_torch.windows.ego_motion import compensate
@@ -153,5 +152,5 @@ def deskew_objects(window: Window, result: FlowResult, sweep_interval: float = 0
         rotation = relative_transform(before.pose, window.pc1.pose)
         rotation[:3, 3] = 0
         flow = compensate(flow, rotation)
-    times = torch.as_tensor(before.point_times).to(flow.device, torch.float64)
+    times = float64_tensor(before.point_times, flow.device)
     return (read_positions([before], flow.device) - flow * divide(times, interval)).t()
