@@ -36,7 +36,7 @@ def scan_fractions(points: Array, direction: str, origin: Any = (0.0, 0.0, 0.0))
         origin: (3,) float, metres, position of the LiDAR in the frame of the points.
 
     Convention: 0 = the instant of the sweep, negative = earlier. The instant is when the LiDAR looks ahead, unless the
-        name says that it is the start or the end of the turn. The result is in (-0.5, 0.5] for a turn that begins
+        name says that it is the start or the end of the turn. The result is in [-0.5, 0.5] for a turn that begins
         behind, as KITTI's, [-0.25, 0.75) for "clockwise_left", and [0, 1) for one that begins ahead. It is in [0, 1)
         for every "_at_start", and in [-1, 0) for every "_at_end". If you name a wrong start, some points are one turn
         off in every sweep: static objects still stay in place, unless they pass the start.
@@ -123,7 +123,8 @@ def deskew_objects(window: Window, result: FlowResult, sweep_interval: float = 0
     this.
 
     Args:
-        window: the sweeps of the flow; `pc0.point_times` and the poses and time stamps of pc0 and pc1 are used.
+        window: the sweeps of the flow; `pc0.point_times` and the poses of pc0 and pc1 are used, and the time
+            stamps if all sweeps have one.
         result: flow of the points of pc0, by a preset that uses point times (`default`, `offline`, `live`).
         sweep_interval: seconds from t to t+1 if a sweep of the window has no time stamp, as in the settings.
 
