@@ -191,10 +191,10 @@ def _results(batch: Batch, motion: Motion) -> list[FlowResult]:
     ]
     columns = (residual, batch.pose_flow, residual + batch.pose_flow, cluster_id, score, is_valid, *probabilities)
     sizes = [rows.stop - rows.start for rows in batch.rows]
-    if len(sizes) == 1:
-        return [FlowResult(*columns)]
-    # Copies, so that a result that you keep or pickle does not hold the whole batch.
-    of_window = [
-        [None] * len(sizes) if column is None else [each.clone() for each in column.split(sizes)] for column in columns
-    ]
+    of_window = [[None] * len(sizes) if column is None else _divided(column, sizes) for column in columns]
     return [FlowResult(*fields) for fields in zip(*of_window)]
+
+
+def _divided(values: Tensor, sizes: list[int]) -> list[Tensor]:
+    """Divide rows into copies, so that a result that you keep or pickle does not hold the whole batch."""
+    return [values] if len(sizes) == 1 else [part.clone() for part in values.split(sizes)]

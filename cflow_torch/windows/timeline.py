@@ -111,8 +111,8 @@ def _entries(
 def source_sweeps(window: Window, config: Config) -> list[SourceSweep]:
     """List pc0, the history, then the sweeps after t+1.
 
-    We skip repeats of a listed sweep and, after t+1, of pc1, and older and later sweeps without points: they do not tell
-    that a place is empty.
+    We skip repeats of a listed sweep and, after t+1, of pc1. Older and later sweeps without points are skipped, too,
+    because they do not tell that a place is empty.
     """
     if len(window.pcf) > config.num_future:
         raise CFlowError(
