@@ -281,8 +281,8 @@ class FlowResult:
         residual_flow: (N, 3) float32, metres per sweep interval, axes of ego1: motion of objects.
         pose_flow: (N, 3) float32, metres, T_ego1_ego0 p - p: apparent motion that ego motion alone causes.
         flow: (N, 3) float32, metres, total flow, the sum of the two.
-        cluster_id: (N,) int64, 0 ... M-1 in the order of each cluster's first pixel; -1 = in no cluster that has
-            points both at t+1 and before.
+        cluster_id: (N,) int64, numbers from 0 on, in the order of each cluster's first pixel, some of which may be
+            skipped; -1 = in no cluster that has points both at t+1 and before.
         score: (N,) float32 in [0, 1], normalised cross-correlation of the cluster with t+1 at the peak (finest scale;
             verified method: scale of the object). It is not a probability. It is 0 where cluster_id is -1, and in
             the verified method for objects that no candidate moves.
