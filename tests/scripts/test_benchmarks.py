@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from small_logs import make_small_drive
 
 from cflow_torch import CorrelationFlow, Sweep, VerifiedFlow, Window, make_config
+from cflow_torch.config import PRESETS
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
 
@@ -203,6 +204,9 @@ def test_true_and_false_labels_are_counted(script: Any, scene: Path) -> None:
     assert found == missed and false > missed
 
 
+NEAR = (-20.0, -20.0, -float("inf"), 20.0, 20.0, float("inf"))
+
+
 def test_every_step_can_be_left_out(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the ablation replaces is a step of the method, and it replaces something but in the first row."""
     script("figures", "drives")
@@ -212,12 +216,19 @@ def test_every_step_can_be_left_out(script: Any, monkeypatch: pytest.MonkeyPatch
         changes, replaced = steps.score_without(None, name)
         assert changes == steps.SETTINGS.get(name, {})
         assert bool(changes or replaced) == (name != "all steps")
-        model = VerifiedFlow.from_preset("default", num_history=0, **changes)
+        model = VerifiedFlow.from_preset("default", num_history=0, point_cloud_range=NEAR, **changes)
         for step, replacement in replaced.items():
             assert callable(getattr(model, step))
             setattr(model, step, replacement)
         car = 0.1 * torch.cartesian_prod(torch.arange(45.0), torch.arange(18.0), torch.arange(15.0)) + 5.05
         assert model([Window(Sweep(car), Sweep(car + torch.tensor([0.5, 0.0, 0.0])))])[0].residual_flow.any()
+
+
+def test_every_preset_has_the_history_and_the_region_of_a_set(script: Any) -> None:
+    run = script("ablation", "run")
+    for preset in PRESETS:
+        config = make_config(preset, **run.of_set(preset, 2, 35.0))
+        assert config.num_history in (0, 2) and config.point_cloud_range[3] == 35.0
 
 
 def test_a_step_of_a_model_can_be_replaced() -> None:
