@@ -142,15 +142,14 @@ class Frames:
     def vehicle_of(self, frame: str) -> str:
         """Return the frame of the vehicle that carries a frame, or that drives in it; "" = none is known.
 
-        The vehicle is base_link, if it is connected. Otherwise it is the first frame with z up on the way from the
-        given one to the moving frame that carries it. If no frame carries it, it may be that of the world. The vehicle
-        is then the only frame that moves in it.
+        The vehicle is base_link, if it is connected, unless both move in a frame above both: then it is another one.
+        Otherwise it is the first frame with z up on the way from the given one to the moving frame that carries it. If
+        no frame carries it, it may be that of the world. The vehicle is then the only frame that moves in it.
         """
         chain = self.chain(frame)
         bases = [each for each in (*chain, *self._samples) if each.split("/")[-1] == BASE]
-        related = [each for each in bases if self.are_joined(each, frame)]
-        # If both move in a frame that is above both, they are two vehicles.
-        related = [each for each in related if not (self.drives_in(each, frame) and self.drives_in(frame, each))]
+        joined = [each for each in bases if self.are_joined(each, frame)]
+        related = [each for each in joined if not (self.drives_in(each, frame) and self.drives_in(frame, each))]
         moving = [child for child in chain if self.is_moving(child)]
         inside = self.moving_in(frame)
         if related:
