@@ -23,7 +23,6 @@ from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import constant, divide, flat_nonzero
-from cflow_torch.types import MOVING
 from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.columns import Pixels
 from cflow_torch.verified.comparisons import count_in_place
@@ -51,7 +50,7 @@ class MotionMargin(NamedTuple):
 def motion_margin(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigid: RigidMotion) -> MotionMargin:
     """Find which objects move, by the margins of their motions.
 
-    Convention: an object moves if its speed is at least `MOVING`, and P(moving) of its bin at least `_LEAST_LIKELY`.
+    Convention: an object moves if P(moving) of its bin is at least `_LEAST_LIKELY`.
 
     Cost: seven lookups for each pixel of the nodes with a motion and each sweep.
     """
@@ -65,7 +64,7 @@ def motion_margin(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigi
 
     moving = constant(tuple(TABLE["moving"]), torch.float32, bins.device).index_select(0, bins)
     least = constant(_LEAST_LIKELY, torch.float32, bins.device).index_select(0, 2 * has_history + is_fast)
-    return MotionMargin(bins, (speed >= MOVING) & (moving >= least))
+    return MotionMargin(bins, moving >= least)
 
 
 def _margins(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigid: RigidMotion, is_fast: Tensor) -> Tensor:

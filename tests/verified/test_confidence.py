@@ -186,13 +186,18 @@ def test_a_remnant_has_the_margin_of_its_whole_node():
     assert int(is_remnant.sum()) == 2 and bins[0] == bins[1]
 
 
-def test_a_motion_below_the_least_one_is_static(monkeypatch):
-    monkeypatch.setattr(motion_margin, "MOVING", 0.2)
-    car = 0.1 * torch.cartesian_prod(torch.arange(45.0), torch.arange(18.0), torch.arange(15.0)) + 5.05
-    for speed in (0.15, 0.25):
-        window = Window(Sweep(car), Sweep(car + torch.tensor([speed, 0.0, 0.0])))
-        (result,) = make_model("default")([window])
-        assert bool(result.residual_flow.any()) == (speed > 0.2)
+def test_an_evident_motion_has_a_flow_however_slow_it_is():
+    """The rear and one side of a car at 0.9 m/s, ahead of a LiDAR of 20 Hz."""
+    body = torch.cartesian_prod(torch.arange(45.0), torch.arange(18.0), torch.arange(15.0))
+    car = 0.1 * body[(body[:, 0] == 0) | (body[:, 1] == 17)] + 5.05
+    wall = 0.1 * torch.cartesian_prod(torch.arange(80.0), torch.arange(2.0), torch.arange(15.0)) - 8.05
+    newest, sweep_t, *older = (
+        Sweep(torch.cat((car - torch.tensor([0.045 * k, 0.0, 0.0]), wall)), timestamp_ns=(9 - k) * 50_000_000)
+        for k in range(6)
+    )
+    (result,) = make_model("default")([Window(sweep_t, newest, tuple(older))])
+    assert (result.residual_flow[: len(car), 0] - 0.045).abs().max() < 0.002
+    assert not result.residual_flow[len(car) :].any()
 
 
 def test_a_bus_that_turns_moves():
