@@ -33,6 +33,8 @@ class Settings:
     def of(cls: type[Kind], values: Mapping[str, Any]) -> Kind:
         """Make settings from a dictionary. Missing ones get their defaults."""
         kind: Any = cls
+        if not isinstance(values, Mapping):
+            raise CFlowError(f"{cls.PREFIX.rstrip('.')}={values!r}: give its settings, {cls.PREFIX}NAME=VALUE")
         if cls.NAMED_BY:
             name: Any = values.get(cls.NAMED_BY)
             if name not in cls.kinds():

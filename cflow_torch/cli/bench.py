@@ -8,13 +8,14 @@ import torch
 
 from cflow_torch.cli.commands import Bench
 from cflow_torch.cli.logs import open_first_log
-from cflow_torch.cli.outputs import machine, output_folder, versions
+from cflow_torch.cli.outputs import machine, output_folder
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log, window
 from cflow_torch.estimate import make_model
 from cflow_torch.evaluation.tables import markdown
+from cflow_torch.fleet.manifest import versions
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.stages import TimedModel, time_report
 from cflow_torch.types import Window

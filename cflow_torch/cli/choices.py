@@ -39,6 +39,12 @@ def known_settings(command: type[Command]) -> Known:
     return known
 
 
+def free_names(command: type[Command]) -> list[str]:
+    """Return the dotted names of the settings on whose values no result depends."""
+    known = known_settings(command)
+    return [name for name, owners in known.items() if any(limits and limits["free"] for limits in owners.values())]
+
+
 def _of_class(kind: type[Settings], prefix: str = "") -> Iterator[_Named]:
     for f in own_fields(kind):
         if issubclass(f.metadata["kind"], Settings):

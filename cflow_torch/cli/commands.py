@@ -96,9 +96,11 @@ class Local(Engine):
     """Worker processes of this machine."""
 
     name: str = setting("local", "the engine; engine= chooses it", choices=("local",))
-    timeout: float = _above_0(600, "seconds for a frame after which a silent worker is replaced (with several workers)")
+    timeout: float = _above_0(
+        600, "seconds without a finished batch after which a worker is replaced (with several workers)"
+    )
     memory: float | None = _above_0(
-        None, "limit of the address space of each worker on a CPU, in bytes, for example 8e9; null = no limit"
+        None, "limit of the address space of each worker on a CPU, in bytes, such as 8e9; null = none; not on Windows"
     )
 
 
@@ -267,9 +269,10 @@ class Label(FlowFiles):
     Each sweep gets the keys dufo (dynamic), dufocluster, cluster and nnd. It gets ground_mask if it has none. Types and
     meanings are those of OpenSceneFlow's own scripts. First, the command estimates the flow like `cflow flow`, with the
     preset offline, which uses earlier and later sweeps. Then each scene is copied, labelled and replaced, so a killed
-    run leaves the old scene or the new one. Run the command again to resume; labelled scenes are skipped. The report,
-    cflow_label-0-of-1.json, is next to the scenes. You can delete OUTPUT when all scenes are labelled. With shards, the
-    process that completes the flow of a scene labels it. The exit statuses are those of `cflow flow`.
+    run leaves the old scene or the new one. Run the command again to resume, also with overwrite=true: scenes that have
+    the labels of these settings are skipped, and need no flow. So you can delete OUTPUT when all scenes are labelled.
+    The report, cflow_label-0-of-1.json, is next to the scenes. With shards, the process that completes the flow of a
+    scene labels it. The exit statuses are those of `cflow flow`.
 
     examples:
       cflow label /data/scenes/train
@@ -281,6 +284,7 @@ class Label(FlowFiles):
     SUMMARY: ClassVar[str] = "write pseudo-labels for self-supervised training into OpenSceneFlow's scenes"
 
     output: str = _output("outputs/label", "folder for the flow that the labels follow from")
+    overwrite: bool = _overwrite("true = replace labels of other settings or programs, and flow of other settings")
     model: Config = group("offline", kind=Config)
     data: dict[str, Any] = group("hdf5")
 
@@ -364,18 +368,17 @@ class Plot(Command):
 
     SUMMARY: ClassVar[str] = "draw flow, clusters, key points, correlation, scales or an animation"
     NAMED_BY: ClassVar[str] = "picture"
-    CHOOSES_PAIRS: ClassVar[bool] = True  # of an animation
     PRESET: ClassVar[str] = ""  # that the picture chooses, "" = none
     PIXEL_SIZES: ClassVar[tuple[float, ...]] = ()  # that the picture chooses
 
     output: str = _output("outputs/plot", "local folder; the file is named after the picture")
     device: str = _device()
     log: str | None = _path("id of the log; null = the first one")
-    deskew: bool = setting(
-        False, "true = draw moving objects where they were at the time of the sweep (by point times)"
-    )
     pair: int | None = setting(
-        None, "index of the pair in the log, from 0; null = 3, or the last pair of a shorter log", kind=int, low=0
+        None,
+        "index of the pair in the log, from 0; null = the fourth pair, or the last one of a shorter log",
+        kind=int,
+        low=0,
     )
     picture: str = group("flow")
 
@@ -385,7 +388,16 @@ class Plot(Command):
 
 
 @dataclass(frozen=True)
-class FlowPicture(Plot):
+class FromAbove(Plot):
+    """The points of sweep t from above."""
+
+    deskew: bool = setting(
+        False, "true = draw moving objects where they were at the time of the sweep (by point times)"
+    )
+
+
+@dataclass(frozen=True)
+class FlowPicture(FromAbove):
     """The flow from above. If the log has labels, the truth and the error are drawn next to it."""
 
     truth: bool | str = setting(
@@ -395,7 +407,7 @@ class FlowPicture(Plot):
 
 
 @dataclass(frozen=True)
-class ClustersPicture(Plot):
+class ClustersPicture(FromAbove):
     """The points of sweep t coloured by cluster.
 
     With model=paper those that are correlated, with model=default those that were selected.
@@ -434,6 +446,8 @@ class ScalesPicture(CorrelationPicture):
 @dataclass(frozen=True)
 class Animation(Plot):
     """The flow of several pairs, one after the other, with the same view and colours. `pair` is ignored."""
+
+    CHOOSES_PAIRS: ClassVar[bool] = True
 
     count: int | None = _count(None, "number of pairs, from data.first, every data.step; null = to the end of the log")
     format: str = setting("gif", "gif | mp4 (extra video)", choices=("gif", "mp4"))
@@ -510,7 +524,7 @@ class Stream(Command):
         1.0, "factor on the speed of the recording; null = as fast as possible", optional=True
     )
     max_gap: float = setting(0.5, "seconds; sweeps with a longer gap between them are not compared")
-    count: int | None = _count(None, "number of sweeps; null = all")
+    count: int | None = setting(None, "number of sweeps; null = all", kind=int, low=2)
 
 
 @dataclass(frozen=True)

@@ -6,29 +6,35 @@ import csv
 import io
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
 from hydra.experimental.callback import Callback
 
+from cflow_torch.cli.choices import free_names
+from cflow_torch.cli.commands import Eval
+from cflow_torch.cli.settings import as_yaml
+
 RESULTS = "results.json"
 COMPARISON = "comparison.csv"
 # The scores of a class with fewer dynamic points are uncertain. One pedestrian has about 1000 in ten sweeps.
 _FEW = 1000
-# A setting and its value in the name of a job's folder.
-_SWEPT = re.compile(r"(?:^|,)([^=,]+)=(.*?)(?=,[^=,]+=|$)")
+FAILED = "failed pairs or logs"
 _SCORES = {  # those that no job has are left out
     "moving IoU": "moving_iou",
     "mean dynamic error": "dynamic_error",
     "EPE FD [m]": "epe_fd",
     "EPE BS [m]": "epe_bs",
     "seconds a frame": "seconds",
+    FAILED: "failed",
 }
 
 
 class Comparison(Callback):
-    """After `cflow eval -m`, print a table of all jobs in OUTPUT, and write it to OUTPUT/comparison.csv."""
+    """After `cflow eval -m`, print a table of all jobs in OUTPUT, and write it to OUTPUT/comparison.csv.
+
+    The exit status is 1 if pairs or logs of one of these jobs failed.
+    """
 
     def on_multirun_end(self, config: Any, **kwargs: Any) -> None:
         if "experiment_name" not in config:  # another command
@@ -37,7 +43,7 @@ class Comparison(Callback):
         from cflow_torch.data.paths import as_path
         from cflow_torch.evaluation.tables import markdown
 
-        output = as_path(config.output)
+        output = as_path(config["output"])
         header, rows = compare(output)
         if rows:
             text = io.StringIO()
@@ -45,33 +51,53 @@ class Comparison(Callback):
             write_text(output / COMPARISON, text.getvalue())
             shown = [[f"{cell:.4g}" if isinstance(cell, float) else cell for cell in row] for row in rows]
             print("\n".join([f"all jobs in {output}, also in {output / COMPARISON}:", "", *markdown(header, shown)]))
+        if FAILED in header:
+            raise SystemExit(1)
 
 
 def compare(output: Path) -> tuple[list[str], list[list[Any]]]:
     """Compare all jobs with results below a folder: a header, and a row for each job.
 
-    A row has the swept settings, then the scores; "" = no value. If the jobs have scored different data, the digest of
-    the data is between them.
+    A row has the settings in which the jobs differ, then the scores; "" = no value. If the jobs have scored different
+    data, the digest of the data is between them.
     """
     jobs: list[tuple[dict[str, str], list[Any]]] = []
+    columns: dict[str, None] = {}
     for file in sorted(output.glob(f"*/**/{RESULTS}")):
         try:
             record = json.loads(file.read_text(encoding="utf-8"))
             scores = headline(record["results"], record["seconds_per_pair"])
-            digest = record["data"]["digest"]
+            scores["failed"] = len(record["failures"]) or math.nan
+            settings, named = _settings(record["config"])
+            settings["scored data"] = record["data"]["digest"]
         except (ValueError, KeyError, TypeError) as error:
             print(f"{file} is not compared: it is not a results file of this version ({error!r})")
             continue
-        name = file.parent.relative_to(output).as_posix()
-        settings = {**(dict(_SWEPT.findall(name)) or {"job": name}), "scored data": digest}
+        columns.update(dict.fromkeys(named))
         jobs.append((settings, ["" if math.isnan(scores[key]) else scores[key] for key in _SCORES.values()]))
     shown = [k for k in range(len(_SCORES)) if any(scores[k] != "" for _, scores in jobs)]
-    names = list(dict.fromkeys(name for settings, _ in jobs for name in settings if name != "scored data"))
-    if len({settings["scored data"] for settings, _ in jobs}) > 1:
-        names.append("scored data")
+    names = [name for name in (*columns, "scored data") if len({settings.get(name, "") for settings, _ in jobs}) > 1]
     rows = [[settings.get(name, "") for name in names] + [scores[k] for k in shown] for settings, scores in jobs]
     rows.sort(key=lambda row: [_order(cell) for cell in row[: len(names)]])
     return [*names, *(list(_SCORES)[k] for k in shown)], rows
+
+
+def _settings(config: dict[str, Any]) -> tuple[dict[str, str], list[str]]:
+    """Return the settings of a job, and the names of those that describe it.
+
+    A method has many settings: its preset describes it, and those that differ from this preset.
+    """
+    from cflow_torch.config import PRESETS
+    from cflow_torch.data.json_file import json_ready
+    from cflow_torch.fleet.changes import flatten, nearest_preset
+
+    preset = nearest_preset(config["model"])
+    of_preset = {} if preset is None else flatten(json_ready(PRESETS[preset].as_dict()), "model")
+    free = free_names(Eval)
+    settings = {name: value for name, value in flatten(config).items() if name not in free}
+    named = [name for name, value in settings.items() if name not in of_preset or value != of_preset[name]]
+    texts = {name: as_yaml(value) for name, value in settings.items()}
+    return {"model": str(preset), **texts}, ["model", *named]
 
 
 def _order(cell: str) -> tuple[bool, float, str]:

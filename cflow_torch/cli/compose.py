@@ -8,6 +8,8 @@ import traceback
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Iterator
 
 import hydra
@@ -24,7 +26,7 @@ from cflow_torch.cli.words import check_exists
 from cflow_torch.config import PRESETS
 from cflow_torch.errors import CFlowError
 from cflow_torch.fleet.progress import show_warnings_as_lines
-from cflow_torch.setting import Settings
+from cflow_torch.setting import AUTO, Settings
 
 _PARSER = OverridesParser.create()
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
@@ -76,7 +78,8 @@ def run_with_hydra(name: str, overrides: list[str], options: list[str]) -> None:
     def job(composed: Any) -> Any:
         with errors_told(name):
             values: Any = OmegaConf.to_container(composed, resolve=True)
-            values.pop("versions", None)  # of the config.yaml of an earlier run
+            for name_of_record in ("command", "versions"):  # in the config.yaml of an earlier run
+                values.pop(name_of_record, None)
             settings = WITH_SETTINGS[name].of(values)  # checks the values, before torch is imported
             show_warnings_as_lines()
             settings = replace(settings, data=_complete(settings))
@@ -85,14 +88,17 @@ def run_with_hydra(name: str, overrides: list[str], options: list[str]) -> None:
             keep_freed_memory()
             return import_module(f"cflow_torch.cli.{name}").task(settings)
 
-    with errors_told(name):
+    with errors_told(name), TemporaryDirectory() as folder:
         # A job's folder is named after the swept settings, and after experiment and data.label if they are given.
         parsed = _PARSER.parse_overrides(overrides)
         fixed = {str(one.key_or_group) for one in parsed if not one.is_sweep_override()}
         unnamed = {"output", "overwrite", *fixed} - {"experiment", "data.label"}
         names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(sorted(unnamed))}]"
+        # Hydra, its sweepers and launchers write their own files to OUTPUT. They know no object stores.
+        is_remote = any(one.key_or_group == "output" and "://" in str(one.value()) for one in parsed)
+        dirs = [f'hydra.sweep.dir="{Path(folder).as_posix()}"'] if is_remote else []
         os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
-        sys.argv = [f"cflow {name}", *overrides, names, *options]
+        sys.argv = [f"cflow {name}", *dirs, *overrides, names, *options]
         job()
 
 
@@ -108,7 +114,7 @@ def _complete(settings: Command) -> dict[str, Any]:
                 sys.path.append(source.path)
         return {"label": str(HydraConfig.get().runtime.choices.get("data")), "first": 0, "step": 1, **data}
     root = data.get("root")
-    if root == NOT_GIVEN:
+    if root in (NOT_GIVEN, []) or (root is None and "root" in data and data["name"] != AUTO):
         raise CFlowError("the data is missing: give data.root=PATH, or only the path")
     for path in root if isinstance(root, list) else [root]:
         if isinstance(path, str):

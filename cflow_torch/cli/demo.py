@@ -32,7 +32,7 @@ def task(cfg: Demo) -> None:
     logs, failures = open_logs(cfg.data)
     if logs:
         check_pair(cfg.pair, logs[0])
-    read_config(ensure_writable(output))  # one of others fails now, not after the work
+    read_config(cfg, ensure_writable(output))  # one of others fails now, not after the work
     results: list[tuple[int, FlowResult]] = []
 
     def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
@@ -49,7 +49,7 @@ def task(cfg: Demo) -> None:
 
     for log in logs:
         remove_stale(output / log.log_id)
-    pairs = [(log, index) for log in logs for index in range(len(log.timestamps) - 1)]
+    pairs = [(log, index) for log in logs for index in log.pairs]
     times: list[CallTime] = []
     failures += for_each_pair(pairs, model, keep, times)
     scores.report(output, logs, time_report(times), failures)

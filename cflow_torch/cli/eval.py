@@ -6,14 +6,15 @@ import hashlib
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Mapping, Sequence
+from typing import Any, Callable, Mapping, Sequence
 
 import numpy as np
 
 from cflow_torch.cli.commands import Demo, Eval
 from cflow_torch.cli.comparison import RESULTS, headline, summary
-from cflow_torch.cli.failures import Failures, UnfinishedJob, finish
+from cflow_torch.cli.failures import Failures, UnfinishedJob, collect_failures, finish
 from cflow_torch.cli.logs import chosen_pairs, open_logs
 from cflow_torch.cli.outputs import (
     check_made_by,
@@ -22,21 +23,22 @@ from cflow_torch.cli.outputs import (
     output_folder,
     read_config,
     settings_record,
-    versions,
     write_config,
 )
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import read_json, write_json
-from cflow_torch.data.log import Log
+from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.estimate import make_model
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
-from cflow_torch.fleet.manifest import are_of_same_log, describe_log
+from cflow_torch.fleet.manifest import are_of_same_log, describe_log, versions
 from cflow_torch.simulator.benchmark import generator_key
 from cflow_torch.stages import CallTime, time_report
 from cflow_torch.types import CFlowError, FlowResult, Window
+
+_KEPT = 32  # labels, as many as pairs that are read ahead
 
 
 def task(cfg: Eval) -> float:
@@ -53,16 +55,19 @@ def task(cfg: Eval) -> float:
             finish(failures)
         return objective(record["results"])
     model = make_model(cfg.model, cfg.device)
-    read_config(ensure_writable(output))  # one of others fails now, not after the work
-    pairs = [(log, index) for log in logs for index in chosen_pairs(log, cfg.data)]
+    read_config(cfg, ensure_writable(output))  # one of others fails now, not after the work
+    pairs: list[tuple[Log, int]] = []
+    for log in logs:
+        with collect_failures(failures, log.log_id):
+            pairs += [(log, index) for index in chosen_pairs(log, cfg.data)]
     times: list[CallTime] = []
-    failures += for_each_pair(pairs, model, scores.add, times)
+    failures += for_each_pair(pairs, model, scores.add, times, scores.needs)
     if scores.metrics.counts["num_frames"] == 0 and failures:
         raise CFlowError("no pair could be scored; {} failed first: {}".format(*failures[0]))
     if scores.metrics.counts["num_frames"] == 0:
         raise CFlowError("no pair has labels, so there is nothing to score; `cflow flow` needs no labels")
     results = scores.report(output, logs, time_report(times), failures)
-    with suppress(UnfinishedJob):  # a job of a sweep returns its score; a single run exits with status 1
+    with suppress(UnfinishedJob):  # a job of a sweep returns its score; `Comparison` gives the exit status
         finish(failures)
     return objective(results)
 
@@ -73,10 +78,18 @@ class Scores:
     def __init__(self, cfg: Demo | Eval) -> None:
         self.metrics = SceneFlowMetrics(cfg.definition)
         self._cfg, self._digest = cfg, hashlib.sha256()
+        # We ask for labels before the window is read, and again when its flow is known.
+        self._labels: Callable[[Log, int], FlowLabels | None] = lru_cache(_KEPT)(lambda log, index: log.labels(index))
+
+    def needs(self, log: Log, index: int) -> bool:
+        """Test whether a pair has labels; damaged ones are reported when its flow is added."""
+        with suppress(CFlowError, OSError):
+            return self._labels(log, index) is not None
+        return True
 
     def add(self, log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         """Add the flow of one pair, if the pair has labels."""
-        labels = log.labels(index)
+        labels = self._labels(log, index)
         if labels is None:
             return
         parts: dict[str, Any] = {"eval_mask": log.eval_mask(index)}

@@ -44,8 +44,11 @@ def finish(failures: Failures) -> None:
 
 
 def end_unfinished(message: str, status: int = 1) -> None:
-    """Exit with a status. A job of a parameter sweep raises `UnfinishedJob`, so Hydra first runs the other jobs."""
-    if is_sweep():
+    """Exit with a status. A job of a parameter sweep raises `UnfinishedJob`, so Hydra first runs the other jobs.
+
+    A signal, whose status is 128 or more, ends the whole sweep.
+    """
+    if is_sweep() and status < 128:
         raise UnfinishedJob(message)
     raise SystemExit(status)
 

@@ -38,7 +38,7 @@ _FOR_MOVING = {"residual", "moving"}
 
 
 def task(cfg: Flow) -> None:
-    run = FlowRun(cfg, _contents(cfg))
+    run = FlowRun(cfg, _contents(cfg), cfg.overwrite)
     if cfg.dry_run:
         print(run.forecast())
         return

@@ -4,28 +4,32 @@ from __future__ import annotations
 
 import os
 import sys
+from concurrent.futures import BrokenExecutor
 from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from time import perf_counter
 from typing import Any, Callable, Iterator, Sequence
 
 from cflow_torch.cli.commands import FlowFiles
 from cflow_torch.cli.failures import Failures, end_unfinished
 from cflow_torch.cli.logs import find_logs
-from cflow_torch.cli.outputs import output_folder, read_config, settings_record, versions, write_config
+from cflow_torch.cli.outputs import output_folder, read_config, settings_record, write_config
 from cflow_torch.cli.track_formats import TRACK_FILES
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.catalog import source_name
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
+from cflow_torch.fleet.executors import Executor
 from cflow_torch.fleet.job import Job, Part, find_shard
 from cflow_torch.fleet.machine import choose_batch, choose_devices, frames_per_worker
-from cflow_torch.fleet.manifest import check_logs, clear_log
+from cflow_torch.fleet.manifest import check_logs, clear_log, is_of_run, versions
 from cflow_torch.fleet.parallel import local_executors
 from cflow_torch.fleet.ray_engine import ray_executors
 from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
 from cflow_torch.fleet.work import open_quickly
 from cflow_torch.setting import AUTO
+from cflow_torch.types import CFlowError
 
 _ENGINES: dict[str, Callable[..., Any]] = {"local": local_executors, "ray": ray_executors}
 
@@ -36,9 +40,10 @@ class FlowRun:
     Args:
         cfg: settings of the command.
         contents: the columns of a flow file.
+        redo: compute frames of the same settings again, too.
     """
 
-    def __init__(self, cfg: FlowFiles, contents: Sequence[str]) -> None:
+    def __init__(self, cfg: FlowFiles, contents: Sequence[str], redo: bool) -> None:
         self._cfg = cfg
         self._devices = choose_devices(cfg.device, cfg.engine.workers, os.environ)
         self.logs = find_logs(cfg.data)
@@ -50,14 +55,18 @@ class FlowRun:
             output=str(self.output),
             contents=tuple(contents),
             batch=choose_batch(cfg.engine.batch, self._devices[0]),
-            redo=cfg.overwrite,
+            redo=redo,
         )
+        self.done: frozenset[Any] = frozenset()  # sources of logs that need no flow
         self.shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
 
     @property
     def parts(self) -> list[Part]:
-        """The logs of this shard, or the parts of them that are its own."""
-        return self.shard.parts(self.logs.sources)
+        """The logs of this shard, or the parts of them that are its own, without those that are `done`."""
+        return self._parts()
+
+    def _parts(self, workers: int = 1) -> list[Part]:
+        return [part for part in self.shard.parts(self.logs.sources, workers) if part.source not in self.done]
 
     def open_logs(self) -> Iterator[Log]:
         """Open the logs of this shard one by one, without what takes time."""
@@ -72,42 +81,43 @@ class FlowRun:
 
     def compute(self) -> dict[str, Any]:
         """Write the flow files of this shard, and return the report of `run_fleet`."""
-        read_config(ensure_writable(self.output))  # one of others fails now, not when logs are cleared
+        read_config(self._cfg, ensure_writable(self.output))  # one of others fails now, not when logs are cleared
         self._check_output()
-        if self._cfg.overwrite and self.shard.count == 1:
-            for log in self.open_logs():
-                clear_log(self.output / log.log_id, TRACK_FILES)
-        write_config(self._cfg, self.output)
         devices = self._useful_devices()
         settings = asdict(self._cfg.engine)
         name = settings.pop("name")
         own = {key: value for key, value in settings.items() if key not in ("workers", "batch")}
         with _ENGINES[name](self.job, devices, **own) as executors:
-            parts = self.shard.parts(self.logs.sources, len(devices))
+            if self._cfg.overwrite and self.shard.count == 1:
+                _start(executors[0])
+                for folder in (self.output / log.log_id for log in self.open_logs()):
+                    if self.job.redo or not is_of_run(folder, self.job.identity):
+                        clear_log(folder, TRACK_FILES)
+            write_config(self._cfg, self.output)
+            parts = self._parts(len(devices))
             about = {"config": settings_record(self._cfg), "versions": versions()}
             report = run_fleet(executors, parts, self.job, devices, self.shard, name, about)
         self._computed = perf_counter()
         return report
 
-    def finish(self, report: dict[str, Any], failures: Failures) -> None:
+    def finish(self, report: dict[str, Any], failures: Failures, *copies: Path) -> None:
         """Print the report and what is missing, and exit with the status of the run unless it is complete.
 
-        `failures` is what failed when the flow was used, after `compute`.
+        `failures` is what failed when the flow was used, after `compute`. `copies` are more files for the report.
         """
         file = report_file(self.job.output, self.shard)
+        if failures:
+            report["failures"] += failures
+            report.update(status="incomplete", exit_status=1)
         if not report["stopped_by"]:  # a signal leaves no time for this
             report["seconds"] += perf_counter() - self._computed
-            with suppress(OSError):  # the run has reported it
-                write_json(file, report)
+            for path in (file, *copies):
+                with suppress(OSError):  # the run has reported it
+                    write_json(path, report)
         print(f"{format_report(report)}\nflow files in {self.job.output}, report in {file}")
-        status = report["exit_status"] or int(bool(failures))
-        if status:
-            lines = [format_missing(report), *(f"  {name}: {message}" for name, message in failures)]
-            print("\n".join(["missing:", *filter(None, lines)]), file=sys.stderr)
-            what = (
-                f"some frames are missing: see {file}" if report["exit_status"] else "some files could not be written"
-            )
-            end_unfinished(what, status)
+        if report["exit_status"]:
+            print(f"missing:\n{format_missing(report)}", file=sys.stderr)
+            end_unfinished(f"something is missing: see {file}", report["exit_status"])
 
     def _check_output(self) -> None:
         """Make sure that the results may be added to the output."""
@@ -126,3 +136,12 @@ class FlowRun:
             if count >= least * len(self._devices):
                 break
         return self._devices[: max(1, count // least)]
+
+
+def _start(executor: Executor) -> None:
+    """Start a worker. If it cannot start, for example on a broken GPU, that is a `CFlowError`."""
+    try:
+        executor.call("next_event", False)  # a worker without a part has no event
+    except (BrokenExecutor, CFlowError) as error:
+        executor.close()
+        raise CFlowError(f"no worker can start: {error}") from error

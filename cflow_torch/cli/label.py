@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
@@ -14,7 +15,6 @@ from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.cli.flow_run import FlowRun
 from cflow_torch.cli.stored_flow import stored_flow
 from cflow_torch.data.hdf5.writer import check_writable, labelled_by, write_hdf5_labels
-from cflow_torch.data.json_file import write_json
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.machine import choose_devices
@@ -23,13 +23,16 @@ from cflow_torch.types import CFlowError
 
 
 def task(cfg: Label) -> None:
-    run = FlowRun(cfg, _contents(cfg))
+    run = FlowRun(cfg, _contents(cfg), redo=False)  # the same settings give the same labels
+    run.done = frozenset(scene for scene in run.logs.sources if _maker(scene) == run.job.identity["hash"])
     if cfg.dry_run:
         print(run.forecast())
         return
     _check(cfg, run)
     report = run.compute()
-    run.finish(report, [] if report["stopped_by"] else _label(cfg, run, report))
+    failures = [] if report["stopped_by"] else _label(cfg, run, report)
+    file = run.logs.sources[0].parent / f"cflow_label-{run.shard.index}-of-{run.shard.count}.json"
+    run.finish(report, failures, file)
 
 
 def _contents(cfg: Label) -> tuple[str, ...]:
@@ -45,16 +48,23 @@ def _contents(cfg: Label) -> tuple[str, ...]:
 def _check(cfg: Label, run: FlowRun) -> None:
     for scene in run.logs.sources:
         check_writable(scene)
-        maker = None
-        with suppress(CFlowError):  # a scene that cannot be read is reported later
-            maker = labelled_by(scene)
-        if maker not in (None, run.job.identity["hash"]) and not cfg.overwrite:
+        if _maker(scene) not in (None, run.job.identity["hash"]) and not cfg.overwrite:
             why = "labels of other settings or of another program"
             raise CFlowError(f"{scene} has {why}: give overwrite=true, or label a copy")
 
 
+def _maker(scene: Path) -> str | None:
+    """Return how the labels of a scene were made, None = it has no labels."""
+    with suppress(CFlowError):  # a scene that cannot be read is reported later
+        return labelled_by(scene)
+    return None
+
+
 def _label(cfg: Label, run: FlowRun, report: dict[str, Any]) -> Failures:
-    """Label the scenes of a shard whose flow is complete. If one cannot be written, it stays as it was."""
+    """Label the scenes of a shard whose flow is complete, and list them in the report.
+
+    A scene that cannot be written stays as it was.
+    """
     failures: Failures = []
     labelled: list[str] = []
     waiting: list[str] = []
@@ -65,7 +75,7 @@ def _label(cfg: Label, run: FlowRun, report: dict[str, Any]) -> Failures:
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
         folder = run.output / scene.stem
         with collect_failures(failures, scene.stem):
-            if labelled_by(scene) == run.job.identity["hash"] and not run.job.redo:
+            if labelled_by(scene) == run.job.identity["hash"]:  # by another shard
                 continue
             log = run.logs.open(scene)
             if not {int(log.timestamps[index]) for index in log.pairs} <= complete_frames(folder):
@@ -73,10 +83,8 @@ def _label(cfg: Label, run: FlowRun, report: dict[str, Any]) -> Failures:
                 continue
             flows = (stored(log, index) for index in log.pairs)
             labels = find_labels(log, flows, model, workers)
-            write_hdf5_labels(scene, labels, run.job.identity["hash"], overwrite=run.job.redo)
+            write_hdf5_labels(scene, labels, run.job.identity["hash"], overwrite=cfg.overwrite)
             labelled.append(scene.name)
     print(f"scenes labelled: {len(labelled)}, scenes without complete flow yet: {len(waiting)}")
-    file = scenes[0].parent / f"cflow_label-{run.shard.index}-of-{run.shard.count}.json"
-    write_json(file, {**report, "labelled": labelled, "waiting": waiting, "not_labelled": failures})
-    print(f"report: {file}")
+    report.update(labelled=labelled, without_flow=waiting)
     return failures

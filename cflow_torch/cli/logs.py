@@ -47,16 +47,22 @@ def paths_of(data: dict[str, Any]) -> list[Any]:
 
 
 def chosen_pairs(log: Log, data: Mapping[str, Any], count: int | None = None) -> list[int]:
-    """Return the indices of at most `count` pairs of a log, every `data.step`-th from `data.first` on."""
+    """Return the indices of at most `count` pairs of a log, every `data.step`-th from `data.first` on.
+
+    If there is none, that is a `CFlowError`.
+    """
     chosen = range(data["first"], len(log.timestamps) - 1, data["step"])
-    return [index for index in log.pairs if index in chosen][:count]
+    pairs = [index for index in log.pairs if index in chosen][:count]
+    if not pairs:
+        raise CFlowError(f"data.first={data['first']}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
+    return pairs
 
 
 def check_pair(pair: int, log: Log) -> None:
-    """Reject the index of a pair that the log does not have."""
-    last = len(log.timestamps) - 2
-    if not 0 <= pair <= last:
-        raise CFlowError(f"pair={pair}: log {log.log_id} has pairs 0 to {last}")
+    """Reject the index of a pair that the log does not have, or that reaches over a gap."""
+    if pair not in log.pairs:
+        gaps = f", without {', '.join(map(str, sorted(log.gaps)))} (gaps)" if log.gaps else ""
+        raise CFlowError(f"pair={pair}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}{gaps}")
 
 
 def find_logs(data: dict[str, Any]) -> Logs:

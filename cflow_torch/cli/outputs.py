@@ -10,37 +10,31 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Sequence
 
-import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from cflow_torch import __version__
-from cflow_torch.cli.choices import known_settings
-from cflow_torch.cli.commands import Command, Submit
+from cflow_torch.cli.choices import free_names
+from cflow_torch.cli.commands import WITH_SETTINGS, Command, Submit
 from cflow_torch.cli.failures import is_sweep
 from cflow_torch.cli.info import processor
 from cflow_torch.data.atomic import ensure_writable, write_text
 from cflow_torch.data.json_file import json_ready
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.changes import check_same_run, nearest_preset
+from cflow_torch.fleet.manifest import versions
 from cflow_torch.types import CFlowError
 
 _CONFIG = "config.yaml"
-
-
-def versions() -> dict[str, str]:
-    return {
-        "cflow_torch": __version__,
-        "torch": str(torch.__version__),
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-    }
+_OF_CALL = ("row", "experiment", "shard", "dry_run", "overwrite")
+_DEFAULTS = {"defaults": ["hydra", "_self_"]}  # so that our settings of Hydra also hold for `--config-name config`
 
 
 def machine() -> dict[str, Any]:
-    """Describe the machine, on which times depend: "platform", "cpu", "cores", "threads" (of torch)."""
+    """Describe the machine: "platform", "cpu", "cores", "threads" (of torch), "torch" (its build), "python"."""
     return {
+        "torch": str(torch.__version__),
+        "python": platform.python_version(),
         "platform": platform.platform(),
         "cpu": processor(),
         "cores": os.cpu_count(),
@@ -73,18 +67,26 @@ def local_folder(cfg: Command) -> Path:
 
 
 def settings_record(cfg: Command) -> dict[str, Any]:
-    """Return the settings of a run for YAML and JSON; the command reads them again."""
-    return {name: value for name, value in asdict(cfg).items() if name not in ("row", "experiment")}
+    """Return the settings of a run for YAML and JSON, without those of a single call; the command reads them again."""
+    return {name: value for name, value in asdict(cfg).items() if name not in _OF_CALL}
 
 
 def write_config(cfg: Command, folder: Path) -> None:
     """Write the settings and versions to `folder/config.yaml`, in place of those of an earlier run only."""
-    read_config(folder)
-    write_text(folder / _CONFIG, OmegaConf.to_yaml(OmegaConf.create({**settings_record(cfg), "versions": versions()})))
+    read_config(cfg, folder)
+    config = {**_DEFAULTS, "command": _command(cfg), **settings_record(cfg), "versions": versions()}
+    write_text(folder / _CONFIG, OmegaConf.to_yaml(OmegaConf.create(config)))
 
 
-def read_config(folder: Path) -> dict[str, Any]:
-    """Read the settings and versions of an earlier run; {} = there are none. A file of others is a `CFlowError`."""
+def _command(cfg: Command) -> str:
+    return next(name for name, kind in WITH_SETTINGS.items() if isinstance(cfg, kind))
+
+
+def read_config(cfg: Command, folder: Path) -> dict[str, Any]:
+    """Read the settings and versions of an earlier run of this command; {} = there are none.
+
+    A file of another command, or of others, is a `CFlowError`.
+    """
     file = folder / _CONFIG
     if not file.exists():
         return {}
@@ -92,8 +94,10 @@ def read_config(folder: Path) -> dict[str, Any]:
     with suppress(Exception):  # whatever a file of others holds
         config: Any = OmegaConf.to_container(OmegaConf.create(content.decode("utf-8")))
         if "cflow_torch" in config["versions"]:
-            return config  # type: ignore[no-any-return]
-    raise CFlowError(f"{file} is not a record of cflow, and we do not replace it: give output=FOLDER")
+            config.pop("defaults", None)
+            if config.pop("command", _command(cfg)) == _command(cfg):
+                return config  # type: ignore[no-any-return]
+    raise CFlowError(f"{file} is not a record of `cflow {_command(cfg)}`, and we do not replace it: give output=FOLDER")
 
 
 def made_by(cfg: Command, **more: Any) -> dict[str, Any]:
@@ -106,9 +110,7 @@ def check_made_by(cfg: Command, folder: Path, before: Any, now: Any) -> None:
 
     Settings that are `free` may differ.
     """
-    known = known_settings(type(cfg))
-    free = [name for name, owners in known.items() if any(limits and limits["free"] for limits in owners.values())]
-    check_same_run(folder, json_ready(before), now, free)
+    check_same_run(folder, json_ready(before), now, free_names(type(cfg)))
 
 
 def claim_output(cfg: Submit, folder: Path, results: Sequence[Path]) -> None:
@@ -116,7 +118,7 @@ def claim_output(cfg: Submit, folder: Path, results: Sequence[Path]) -> None:
 
     With `cfg.overwrite`, we remove older results, but not what is not ours.
     """
-    before = read_config(ensure_writable(folder))
+    before = read_config(cfg, ensure_writable(folder))
     for path in results:
         if path.exists() and not before:
             raise CFlowError(f"{path} exists and is not a result of `cflow submit`: give output=FOLDER")

@@ -9,8 +9,9 @@ import os
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
+from itertools import tee
 from queue import SimpleQueue
-from typing import Any, Callable, Iterator, Sequence, Tuple
+from typing import Any, Callable, Iterable, Iterator, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -40,14 +41,15 @@ def for_each_pair(
     model: SceneFlowModel,
     use: Callable[[Log, int, Window, FlowResult], None],
     times: list[CallTime] | None = None,
+    needs: Callable[[Log, int], bool] = lambda log, index: True,
 ) -> Failures:
     """Estimate the flow of pairs, and call `use` with the log, index, window and result of each pair, in order.
 
-    The pairs of a log must follow one another. A bad pair is reported and skipped. The times of all pairs are added to
-    `times`.
+    The pairs of a log must follow one another. Pairs for which `needs` is False are left out; we ask before we read
+    their window. A bad pair is reported and skipped. The times of all pairs are added to `times`.
     """
     failures: Failures = []
-    for (log, index), answer in _answers(pairs, model):
+    for (log, index), answer in _answers(pairs, model, needs):
         with collect_failures(failures, f"{log.log_id}/{log.timestamps[index]}"):
             sweeps, result, time = answer()
             if times is not None:
@@ -56,14 +58,17 @@ def for_each_pair(
     return failures
 
 
-def _answers(pairs: Sequence[LogPair], model: SceneFlowModel) -> Iterator[tuple[LogPair, Answer]]:
+def _answers(
+    pairs: Sequence[LogPair], model: SceneFlowModel, needs: Callable[[Log, int], bool]
+) -> Iterator[tuple[LogPair, Answer]]:
     """Yield each pair and a function that returns its window, flow and time, or raises the error of that pair."""
     devices = choose_devices(model.device, AUTO, os.environ)
     count = min(len(devices), len(pairs) // frames_per_worker(model.config)) if devices[0] == "cpu" else 1
-    windows = _windows(pairs, model.config)
+    needed, ahead = tee(pair for pair in Progress(pairs) if needs(*pair))
+    windows = _windows(ahead, model.config)
     if count < 2:
         timed = TimedModel(model)
-        yield from zip(Progress(pairs), (partial(_estimate, timed, sweeps) for sweeps in windows))
+        yield from zip(needed, (partial(_estimate, timed, sweeps) for sweeps in windows))
         return
     executors = [ProcessExecutor(partial(_Estimator, model)) for _ in range(count)]
     idle: SimpleQueue[ProcessExecutor] = SimpleQueue()
@@ -72,14 +77,14 @@ def _answers(pairs: Sequence[LogPair], model: SceneFlowModel) -> Iterator[tuple[
     threads = ThreadPoolExecutor(count)
     try:
         answers = run_ahead(threads, partial(_estimate_elsewhere, idle), windows, _AHEAD * count)
-        yield from zip(Progress(pairs), (partial(_answer, answer) for answer in answers))
+        yield from zip(needed, (partial(_answer, answer) for answer in answers))
     finally:
         for executor in executors:
             executor.close()
         threads.shutdown()
 
 
-def _windows(pairs: Sequence[LogPair], config: Config) -> Iterator[Window | Exception]:
+def _windows(pairs: Iterable[LogPair], config: Config) -> Iterator[Window | Exception]:
     """Read the window of each pair. An error is yielded, so that the next windows follow."""
     recent: CachedLog | None = None  # the log of the last pair
     for log, index in pairs:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from cflow_torch.cli.commands import Animation, CorrelationPicture, FlowPicture, Plot
+from cflow_torch.cli.commands import Animation, CorrelationPicture, FlowPicture, FromAbove, Plot
 from cflow_torch.cli.failures import finish
 from cflow_torch.cli.logs import check_pair, chosen_pairs, find_logs, paths_of
 from cflow_torch.cli.outputs import chosen_preset, local_folder
@@ -40,8 +40,8 @@ def task(cfg: Plot) -> None:
     if isinstance(cfg, Animation):
         path = _animate(cfg, model, log, output)
     else:
-        last = len(log.timestamps) - 2
-        pair = min(3, last) if cfg.pair is None else cfg.pair  # some history precedes it
+        fourth = (log.pairs[:4] or [0])[-1]  # some history precedes it
+        pair = fourth if cfg.pair is None else cfg.pair
         check_pair(pair, log)
         sweeps = window(log, pair, model.config.num_history, model.config.num_future)
         ensure_writable(output)
@@ -73,12 +73,12 @@ def _draw(cfg: Plot, model: SceneFlowModel, log: Log, pair: int, sweeps: Window)
     if isinstance(cfg, CorrelationPicture):
         draw = plot_scales if cfg.picture == "scales" else plot_correlation
         return draw(sweeps, model.config, cluster_id=cfg.cluster)
-    if cfg.picture == "keypoints":
-        return plot_keypoints(sweeps, model.config)
-    return _from_above(cfg, model, log, pair, sweeps)
+    if isinstance(cfg, FromAbove):
+        return _from_above(cfg, model, log, pair, sweeps)
+    return plot_keypoints(sweeps, model.config)
 
 
-def _from_above(cfg: Plot, model: SceneFlowModel, log: Log, pair: int, sweeps: Window) -> Any:
+def _from_above(cfg: FromAbove, model: SceneFlowModel, log: Log, pair: int, sweeps: Window) -> Any:
     points, (result,) = sweeps.pc0.points, model([sweeps])
     if cfg.deskew:
         points = deskew_objects(sweeps, result, model.config.sweep_interval).cpu()
@@ -106,8 +106,6 @@ def _truth(cfg: FlowPicture, log: Log, pair: int, result: FlowResult) -> np.ndar
 def _animate(cfg: Animation, model: SceneFlowModel, log: Log, output: Path) -> Path:
     """Estimate the flow of several pairs, then draw them. Nothing is written if one of them fails."""
     pairs = chosen_pairs(log, cfg.data, cfg.count)
-    if not pairs:
-        raise CFlowError(f"data.first={cfg.data['first']}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
     ensure_writable(output)
     seconds = log.sweep_times(model.config.sweep_interval)
     frames: list[AnimatedPair] = []

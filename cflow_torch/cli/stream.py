@@ -11,10 +11,12 @@ from tqdm import tqdm
 from cflow_torch.applications.stream import FlowStream
 from cflow_torch.cli.commands import Stream
 from cflow_torch.cli.logs import open_first_log
-from cflow_torch.cli.outputs import machine, output_folder, versions
+from cflow_torch.cli.outputs import machine, output_folder
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
+from cflow_torch.fleet.manifest import versions
+from cflow_torch.types import CFlowError
 
 
 def task(cfg: Stream) -> None:
@@ -24,6 +26,10 @@ def task(cfg: Stream) -> None:
     log = open_first_log(cfg.data)
     ensure_writable(output)
     report = {"log": log.log_id, **play(stream, log, cfg.pace, cfg.count)}
+    if not report["results"]:
+        raise CFlowError(
+            f"no sweep of {log.log_id} is within max_gap={cfg.max_gap:g} s of the next one: give a larger one"
+        )
     report.update(machine=machine(), versions=versions())
     print(_summary(report))
     write_json(output / "stream.json", report)
@@ -56,7 +62,7 @@ def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> d
             progress.set_postfix_str(f"latency {1000 * latencies[-1]:.0f} ms")
     elapsed = time.perf_counter() - begin
     p50, p99 = np.percentile(latencies or [np.nan], (50, 99)).tolist()
-    interval = None if due is None or len(due) < 2 else float(np.median(np.diff(due)))
+    interval = None if due is None else float(np.median(np.diff(due)))
     return {
         "sweeps": len(seconds),
         "results": len(latencies),

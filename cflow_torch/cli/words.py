@@ -23,6 +23,7 @@ _WITH_VALUE = (*_OWN_CONFIGS, "-c", "--cfg", "-p", "--package", "-i", "--info")
 _FLAGS = ("-m", "--multirun", "-r", "--run", "--resolve", "--hydra-help", "--version", "-sc", "--shell-completion")
 _LITERALS = {"null": None, "true": True, "false": False, "inf": math.inf, "nan": math.nan}
 _NOT_PLAIN = "'\"[{(*$"  # characters by which a value is a list, a text, a function or a reference of Hydra's
+_PLAIN = re.compile(r"[A-Za-z_/][\w./-]*", re.ASCII)  # texts that Hydra reads as text, unless they are `_LITERALS`
 _PATHS = {"data.root", "data.cache"}  # text, even if they look like numbers
 # Values that Hydra must read by itself: null, a list, a reference, a function, a quoted text.
 _SYNTAX = re.compile(
@@ -87,9 +88,11 @@ def _check_settings(settings: list[str], command: str, has_own: bool) -> None:
         if key not in known:
             hint = _group_of(value, chosen) or near(key, [*chosen, *known])
             raise CFlowError(f"unknown setting {key!r}{hint}: `cflow {command} --cfg job` prints all settings")
-        if key in PAIR_SETTINGS and not kind.CHOOSES_PAIRS:
-            choosing = [name for name, other in WITH_SETTINGS.items() if other.CHOOSES_PAIRS]
-            raise CFlowError(f"{key} is for cflow {' and cflow '.join(choosing)}: cflow {command} takes every pair")
+        kinds: list[type[Command]] = [kind]
+        if "picture" in chosen:
+            kinds = [PICTURES[name] for name in chosen["picture"] or PICTURES]
+        if key in PAIR_SETTINGS and not any(each.CHOOSES_PAIRS for each in kinds):
+            raise CFlowError(f"{key} is for cflow eval, cflow view and cflow plot picture=animation: leave it out")
         _check_value(key, value, known[key], chosen)
 
 
@@ -180,8 +183,16 @@ def hydra_overrides(command: type[Command], call: Call) -> list[str]:
 
 
 def _as_text(value: str) -> str:
-    """Quote text, or each text of a sweep (a,b), so that Hydra reads no other type: the name 1e5 is not a number."""
-    return value if _SYNTAX.fullmatch(value) else ",".join(map(_quoted, value.split(",")))
+    """Quote text, or each text of a sweep (a,b), if Hydra would read another type: the name 1e5 is not a number.
+
+    Other texts stay as they are, because the folder of a job is named after them.
+    """
+    if _SYNTAX.fullmatch(value):
+        return value
+    texts = value.split(",")
+    return ",".join(
+        text if _PLAIN.fullmatch(text) and text.lower() not in _LITERALS else _quoted(text) for text in texts
+    )
 
 
 def _quoted(value: str) -> str:

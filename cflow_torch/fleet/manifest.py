@@ -41,23 +41,24 @@ _OURS = re.compile(r"[0-9]+\.feather|manifest\.json|\..+\.tmp")
 _LABELS = re.compile(r"[0-9]{6}\.label|\..+\.tmp")
 
 
-def make_identity(
-    config: Config, reader: str, settings: Mapping[str, Any], contents: Sequence[str] = CONTENTS
-) -> dict[str, Any]:
-    """Return what determines a result besides the sweeps: method, data settings, contents of files, versions.
-
-    CPU and CUDA builds of one torch version count as the same.
-    """
-    versions = {
+def versions() -> dict[str, str]:
+    """Return the versions on which results depend. CPU and CUDA builds of one torch version count as the same."""
+    return {
         "cflow_torch": __version__,
         "torch": str(torch.__version__).split("+")[0],
         "numpy": np.__version__,
     }
+
+
+def make_identity(
+    config: Config, reader: str, settings: Mapping[str, Any], contents: Sequence[str] = CONTENTS
+) -> dict[str, Any]:
+    """Return what determines a result besides the sweeps: method, data settings, contents of files, versions."""
     data = {"reader": reader, **{key: value for key, value in settings.items() if key != "check"}}
     free = free_settings(type(config))
     method = {key: value for key, value in asdict(config).items() if key not in free}
     identity = json_ready(
-        {"format": _FORMAT, "method": method, "data": data, "contents": contents, "versions": versions}
+        {"format": _FORMAT, "method": method, "data": data, "contents": contents, "versions": versions()}
     )
     text = json.dumps(identity, indent=1, sort_keys=True) + "\n"
     return {**identity, "hash": hashlib.sha256(text.encode()).hexdigest()}
@@ -71,11 +72,11 @@ def check_logs(output: Path, names: Iterable[str], identity: Mapping[str, Any], 
     has opened it (`checked_manifest`). An object store takes a while for each log, so there we leave it to the workers.
     """
     forget_listings(output)
-    if (overwrite and alone) or is_remote(output):
+    if is_remote(output):
         return
     for folder in (output / name for name in names):
-        before = _read(folder / MANIFEST)
-        if before is None or not complete_frames(folder):
+        before = _read(folder)
+        if before is None or (overwrite and alone) or not complete_frames(folder):
             continue
         remedy = "remove that folder" if overwrite else OVERWRITE
         check_same_run(folder, before.get("run", {}), identity, ["hash"], remedy)
@@ -92,22 +93,20 @@ def checked_manifest(folder: Path, log: Log, identity: Mapping[str, Any]) -> dic
 
 
 def claim_log(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write the manifest of `checked_manifest`, unless there is one. Call this before the first frame is written.
-
-    Frames that are older than the manifest are removed, because nothing says which settings they have.
-    """
-    # We list them before we look for the manifest, so that frames of another process of this run are not among them.
-    older = [name for name in _names(folder) if _FRAME.fullmatch(name)]
+    """Write the manifest of `checked_manifest`, unless there is one. Call this before the first frame is written."""
     if not _is_claimed(folder, manifest):
-        for name in older:
-            (folder / name).unlink(missing_ok=True)
         write_json(folder / MANIFEST, manifest)
-        _check_manifest(folder, _read(folder / MANIFEST) or {}, manifest)  # another process may have been quicker
+        _check_manifest(folder, _read(folder) or {}, manifest)  # another process may have been quicker
+
+
+def is_of_run(folder: Path, identity: Mapping[str, Any]) -> bool:
+    """Test whether a log's folder has results of the run with this identity."""
+    return (_read(folder) or {}).get("run") == identity
 
 
 def _is_claimed(folder: Path, manifest: Mapping[str, Any]) -> bool:
     """Test whether a folder has a manifest, which must be this one; one of another run without frames is replaced."""
-    before = _read(folder / MANIFEST)
+    before = _read(folder)
     if before is None or (before.get("run") != manifest["run"] and not complete_frames(folder)):
         return False
     _check_manifest(folder, before, manifest)
@@ -149,7 +148,7 @@ def clear_log(folder: Path, tracks: Container[str] = ()) -> None:
 
     We remove the manifest last, because it marks the folder as ours.
     """
-    if not (folder / MANIFEST).exists():
+    if _read(folder) is None:
         return
     labels = labels_folder(folder.parent, folder.name)
     for file in labels.iterdir() if labels.is_dir() else ():
@@ -225,10 +224,20 @@ def _digest(log: Log, index: int) -> str:
     return digest.hexdigest()
 
 
-def _read(file: Path) -> dict[str, Any] | None:
+def _read(folder: Path) -> dict[str, Any] | None:
+    """Read the manifest of a log's folder; None = the folder has neither a manifest nor frames.
+
+    Frames without a manifest, and a manifest of others, are a `CFlowError`: we neither replace nor remove them.
+    """
+    # We list the frames first: another process of this run writes its manifest before them.
+    has_frames = any(map(_FRAME.fullmatch, _names(folder)))
     try:
-        return read_json(file)  # type: ignore[no-any-return]
+        manifest = read_json(folder / MANIFEST)
+        if "cflow_torch" in manifest["run"]["versions"]:
+            return manifest  # type: ignore[no-any-return]
     except FileNotFoundError:
-        return None
-    except CFlowError as error:
-        raise CFlowError(f"{file} is not a manifest ({error}): remove that folder, or give output=FOLDER") from None
+        if not has_frames:
+            return None
+    except (CFlowError, LookupError, TypeError):
+        pass  # whatever a file of others holds
+    raise CFlowError(f"{folder} has files that no {MANIFEST} of cflow describes: give output=FOLDER")

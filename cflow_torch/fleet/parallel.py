@@ -8,12 +8,14 @@ from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from queue import Empty, SimpleQueue
 from threading import Event as Flag
 from threading import Thread
 from typing import Any, Callable, Generator, Iterator, Sequence
 
 from cflow_torch.data.catalog import source_name
+from cflow_torch.errors import CFlowError
 from cflow_torch.fleet.executors import Executor, InlineExecutor, ProcessExecutor
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.work import Worker, make_worker
@@ -21,7 +23,7 @@ from cflow_torch.fleet.work import Worker, make_worker
 Events = Generator[Event, None, None]
 _POLL_S = 0.2  # how soon a signal is noticed
 _GRACE_S = 20.0  # after a signal, time to finish the frames that have begun; schedulers kill after 30 s or more
-_REMEDY = "give fewer engine.workers if memory is short, or a larger engine.timeout if a frame takes longer"
+_REMEDY = "give fewer engine.workers if memory is short, or a larger engine.timeout if a batch takes longer"
 
 
 @contextmanager
@@ -32,6 +34,8 @@ def local_executors(
 
     A single worker without a memory limit runs in this process.
     """
+    if memory is not None and (not find_spec("resource") or devices[0] != "cpu"):
+        raise CFlowError("engine.memory is for workers on a CPU, and not for Windows: leave it out")
     if len(devices) == 1 and memory is None:
         yield [InlineExecutor(partial(Worker, job, devices[0]))]
     else:

@@ -16,7 +16,7 @@ from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.executors import Executor, describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, Shard
-from cflow_torch.fleet.manifest import complete_frames
+from cflow_torch.fleet.manifest import complete_frames, is_of_run
 from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.progress import Progress, log_line
 from cflow_torch.fleet.stop_signal import StopSignal
@@ -111,7 +111,8 @@ def count_frames(job: Job, parts: Iterable[Part]) -> Iterator[tuple[str, int, in
         try:
             with open_quickly(job, part.source) as log:
                 stamps = set(part.stamps(log).values())
-                complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
+                folder = as_path(job.output) / log.log_id
+                complete = complete_frames(folder) if not job.redo and is_of_run(folder, job.identity) else set()
                 yield log.log_id, len(stamps), len(stamps - complete)
         except Exception as error:
             yield f"{source_name(part.source)}: cannot be opened: {describe_error(error)}", 0, 0

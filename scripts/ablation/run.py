@@ -105,6 +105,16 @@ def print_row(of_set: str, setting: str, figures: Figures) -> None:
     print(f"| {of_set} | {setting} | {shown} | {moving:.0f} |", flush=True)
 
 
+def of_set(preset: str, history: int, half_side: float | None) -> dict[str, Any]:
+    """Return the settings that all presets have on a set: its history, if the preset takes one, and its region."""
+    settings: dict[str, Any] = {}
+    if "num_history" in make_config(preset).as_dict():
+        settings["num_history"] = history
+    if half_side is not None:
+        settings["point_cloud_range"] = (-half_side, -half_side, -math.inf, half_side, half_side, math.inf)
+    return settings
+
+
 def score_preset(scored: ScoredSet, preset: str, changes: dict[str, Any], steps: Mapping[str, Any] = {}) -> Figures:
     """Score a preset with the history and the region of a set, for a fair comparison, and with the given changes.
 
@@ -112,11 +122,7 @@ def score_preset(scored: ScoredSet, preset: str, changes: dict[str, Any], steps:
 
     Small drives are scored one by one and averaged, as in docs/limits.md.
     """
-    of_set: dict[str, Any] = {"num_history": scored.history}
-    if scored.half_side is not None:
-        half = scored.half_side
-        of_set["point_cloud_range"] = (-half, -half, -math.inf, half, half, math.inf)
-    config = make_config(preset, **{**of_set, **changes})
+    config = make_config(preset, **{**of_set(preset, scored.history, scored.half_side), **changes})
     model, frames = make_model(config), []
     for step, replacement in steps.items():
         setattr(model, step, replacement)

@@ -24,9 +24,10 @@ from opencv_loop import opencv_flow
 from table import markdown
 
 from cflow_torch import Config, Window, make_config, make_model
-from cflow_torch.cli.outputs import machine, versions
+from cflow_torch.cli.outputs import machine
 from cflow_torch.data.catalog import find_sources, open_log, recognise
 from cflow_torch.data.log import Log, window
+from cflow_torch.fleet.manifest import versions
 from cflow_torch.simulator import make_drive
 
 HISTORY = 4
@@ -99,7 +100,7 @@ def main() -> None:
         data_set = recognise(given.path)
         log = open_log(data_set, find_sources(data_set, given.path)[0], check=False)
     sweeps = window(log, min(HISTORY, len(log) - 2), HISTORY)
-    print({**machine(), **versions(), "points": len(sweeps.pc0.points), "older_sweeps": len(sweeps.pch)}, flush=True)
+    print({**versions(), **machine(), "points": len(sweeps.pc0.points), "older_sweeps": len(sweeps.pch)}, flush=True)
     print(markdown([*times(sweeps, given.repeats), *counts(sweeps)]))
 
 

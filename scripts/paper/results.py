@@ -60,7 +60,7 @@ def load_runs(folder: Path) -> dict[str, Records]:
 def row_of(experiment: str, model: dict[str, Any]) -> str:
     sizes, h = model["pixel_sizes"], model.get("num_history", 0)
     if experiment == "keypoints" and model["method"] == "keypoints":
-        is_preset = model["densify"] == "clusters" and model["patch_size"] == PRESETS["keypoints"][1]["patch_size"]
+        is_preset = model["densify"] == "clusters" and model["patch_size"] == PRESETS["keypoints"].patch_size
         return PRESET if is_preset else DENSIFIED[model["densify"]]
     rows = {
         "pixel_size": ", ".join(f"{size:g}" for size in sizes),
@@ -70,7 +70,7 @@ def row_of(experiment: str, model: dict[str, Any]) -> str:
         "scales": f"h={h}, {len(sizes)} scales",
         "keypoints": f"CorrelationFlow (h={h})",
     }
-    return rows.get(experiment, METHODS[model["method"]])
+    return rows.get(experiment, METHODS.get(model["method"], model["method"]))
 
 
 def make_lines(experiment: str, about: dict[str, Any], ours: Records) -> list[Line]:

@@ -17,6 +17,7 @@ from cflow_torch import CFlowError, make_config, make_model
 from cflow_torch.applications import labels
 from cflow_torch.applications.labels import find_labels, label_scene
 from cflow_torch.data.hdf5 import HDF5Log, write_hdf5_results, write_hdf5_scene, writer
+from cflow_torch.data.hdf5.writer import LABELLED
 from cflow_torch.data.log import windows
 
 h5py = pytest.importorskip("h5py")
@@ -174,6 +175,11 @@ def test_existing_labels_are_replaced_only_with_overwrite(
     assert error.count("\n") == 1
     assert file.read_bytes() == before and not list(tmp_path.glob("out/*/*.feather"))
     assert label(scenes, output, "overwrite=true") == 0
+    frames, inode = {f: f.stat().st_mtime_ns for f in tmp_path.glob("out/*/*.feather")}, file.stat().st_ino
+    with h5py.File(scenes / "scene-1.h5", "r+") as scene:
+        del scene.attrs[LABELLED]  # as if the run had been killed before it labelled this scene
+    assert label(scenes, output, "overwrite=true") == 0
+    assert frames == {f: f.stat().st_mtime_ns for f in frames} and file.stat().st_ino == inode, "it is resumed"
     assert all(sweep["dufo"].dtype == np.uint8 and sweep["dufo"].max() == 1 for sweep in stored(file))
     in_python = Path(shutil.copy(drives / "scene-2.h5", tmp_path))
     label_scene(in_python, make_model(ONLINE, "cpu"))
@@ -214,6 +220,8 @@ def test_a_killed_run_leaves_whole_scenes_and_resumes(scenes: Path, tmp_path: Pa
     assert frames == {f: f.stat().st_mtime_ns for f in tmp_path.glob("out/*/*.feather")}, "flow is not computed again"
     assert all("nnd" in sweep for sweep in stored(second))
     assert sorted(name for name in os.listdir(scenes) if not name.endswith(".json")) == sorted(before)
+    shutil.rmtree(tmp_path / "out")
+    assert label(scenes, output) == 0 and not list(tmp_path.glob("out/*/*.feather")), "labelled scenes need no flow"
 
 
 def test_shards_label_every_scene_once(scenes: Path, tmp_path: Path, capsys: Any) -> None:

@@ -126,6 +126,14 @@ def test_returns_of_the_own_vehicle_are_not_a_track() -> None:
     assert len(set(table["id"])) == 1 and len(ids_of(log, table, 1)) == 12
 
 
+@pytest.mark.parametrize("step", [0.0, 0.3])
+def test_cars_below_a_sensor_are_tracks(step: float) -> None:
+    """They drive below a sensor on a bridge, or on a vehicle that drives more slowly than they do."""
+    log = Staged([straight((-6.0, -0.95), (1.4, 0.0))], np.stack([pose(step * k, 0, 0.0) for k in range(12)]))
+    table = track(log, log.results())
+    assert table["is_moving"].all() and len(table["id"]) == 12 and np.allclose(table["vx"], 14.0, atol=0.5)
+
+
 @pytest.mark.parametrize(("step", "place", "is_own"), [(0.9, 1.3, True), (0.9, 3.0, False), (0.1, 1.3, False)])
 def test_mirrors_that_ride_along_are_not_a_track(step: float, place: float, is_own: bool) -> None:
     """A small object beside the vehicle keeps its place: a mirror, one too far away, a person beside a slow robot."""
@@ -416,7 +424,10 @@ def test_wrong_inputs_are_one_clear_error() -> None:
     with pytest.raises(CFlowError, match="order of time"):
         tracker.push(Window(log.sweep(2), log.sweep(3)), log.result(2))
     with pytest.raises(CFlowError, match="rows"):
-        Tracker().push(Window(Sweep(np.zeros((5, 3), np.float32)), log.sweep(3)), log.result(2))
+        tracker.push(
+            Window(Sweep(np.zeros((5, 3), np.float32), timestamp_ns=log.timestamps[4]), log.sweep(5)), log.result(4)
+        )
+    tracker.push((log.sweep(4), log.sweep(5)), log.result(4))
     with pytest.raises(CFlowError, match="cluster_id"):
         Tracker().push(Window(log.sweep(2), log.sweep(3)), FlowResult.of({"residual_flow": torch.zeros(5, 3)}))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import re
 import shutil
 import signal
@@ -42,8 +43,9 @@ def evaluate(cflow: Callable[..., int], log_folder: Path, tmp_path: Path) -> Cal
     return lambda *arguments: cflow(*call, *arguments)
 
 
-def test_demo_writes_all_its_files(tmp_path, cache, cflow, capsys):
+def test_demo_writes_all_its_files(tmp_path, cache, cflow, capsys, monkeypatch):
     pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
     model = ("model.num_history=0", "model.pixel_sizes=[0.4,0.2]", SMALL)
     assert cflow("demo", f"output={tmp_path}", "data.num_sweeps=2", "pair=0", *model) == 0
     (log,) = (AV2Log(folder) for folder in cache.glob("*-2/*/*"))
@@ -64,6 +66,7 @@ def test_demo_writes_all_its_files(tmp_path, cache, cflow, capsys):
     again = tmp_path / "again"
     assert cflow("demo", "--config-dir", tmp_path, "--config-name", "config", f"output={again}") == 0
     assert results_of(again)["results"] == scores["results"]
+    assert not (tmp_path / "outputs").exists() and not list(tmp_path.glob("*.log")), "Hydra writes no files"
     if find_spec("k3d"):
         assert (again / "flow.html").read_bytes() == (tmp_path / "flow.html").read_bytes()
 
@@ -79,7 +82,7 @@ def test_demo_without_the_extras_lacks_only_picture_and_page(tmp_path, cflow, mo
     assert "no page (" in printed.out and "k3d" in printed.out
 
 
-def test_the_page_and_the_picture_of_a_demo_show_the_first_log(log_folder, tmp_path, cflow, monkeypatch):
+def test_the_page_and_the_picture_of_a_demo_show_the_first_log(log_folder, tmp_path, cflow, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     for name in ("a", "b"):
         shutil.copytree(log_folder, tmp_path / "logs" / name)
@@ -91,10 +94,20 @@ def test_the_page_and_the_picture_of_a_demo_show_the_first_log(log_folder, tmp_p
     monkeypatch.setattr(
         demo, "plot_flow", lambda *given, title, **view: (titles.append(title), plot(*given, **view))[1]
     )
+    monkeypatch.setattr(AV2Log, "gaps", frozenset({2}))
     data = ("data=av2", f"data.root={tmp_path / 'logs'}", "data.check=false")
-    assert cflow("demo", *data, f"output={tmp_path / 'out'}", "pair=1", "model=paper", SMALL) == 0
-    assert pages == [("a", 3)] and titles == ["CorrelationFlow, a"]
-    assert results_of(tmp_path / "out")["num_pairs"] == 6
+    call = ("demo", *data, f"output={tmp_path / 'out'}", "model=paper", SMALL)
+    assert cflow(*call, "pair=2") == 2 and "has pairs 0 to 2, without 2 (gaps)" in capsys.readouterr().err
+    assert cflow(*call, "pair=1") == 0
+    assert pages == [("a", 2)] and titles == ["CorrelationFlow, a"]
+    assert results_of(tmp_path / "out")["num_pairs"] == 4, "of two logs, without the pairs over their gaps"
+
+
+def test_a_sweep_writes_to_an_object_store(tmp_path, evaluate, monkeypatch, capsys):
+    pytest.importorskip("upath")
+    monkeypatch.chdir(tmp_path)
+    assert evaluate("-m", "data.step=3,4", "output=memory://swept") == 0 and not list(tmp_path.iterdir())
+    assert "also in memory://swept/comparison.csv" in capsys.readouterr().out
 
 
 def test_demo_and_submit_write_to_this_machine(log_folder, cflow, capsys):
@@ -111,7 +124,8 @@ def test_the_results_file_is_complete(log_folder, tmp_path, evaluate):
     assert record["results"]["definition"] == record["definition"]["name"] == "opensceneflow"
     assert record["definition"]["region"] == "disc" and record["definition"]["speed_edges"][-1] == "inf"
     assert {"bucketed", "three_way", "range_wise", "num_points"} <= set(record["results"])
-    assert set(record["versions"]) == {"cflow_torch", "torch", "numpy", "python"}
+    assert set(record["versions"]) == {"cflow_torch", "torch", "numpy"} and "+" not in record["versions"]["torch"]
+    assert record["machine"]["python"] == platform.python_version(), "another patch version may continue a run"
     assert record["config"]["model"]["pixel_sizes"] == [0.1] and record["config"]["experiment_name"] is None
     assert record["data"]["logs"] == [{"log_id": log_folder.name, "sweeps": 4}] and len(record["data"]["digest"]) == 16
     times = record["seconds_per_pair"]
@@ -120,6 +134,15 @@ def test_the_results_file_is_complete(log_folder, tmp_path, evaluate):
     assert record["failures"] == [] and record["date"].startswith("20")
     assert evaluate("data.first=2", "overwrite=true") == 0
     assert results_of(tmp_path)["data"]["digest"] != record["data"]["digest"], "of what was scored"
+
+
+def test_pairs_without_labels_are_not_estimated(tmp_path, evaluate, monkeypatch, capsys):
+    labels, windows, read = AV2Log._labels, [], pairs.window
+    monkeypatch.setattr(AV2Log, "_labels", lambda log, index: labels(log, index) if index == 1 else None)
+    monkeypatch.setattr(pairs, "window", lambda log, index, *rest: (windows.append(index), read(log, index, *rest))[1])
+    assert evaluate() == 0 and results_of(tmp_path)["num_pairs"] == 1 and windows == [1]
+    assert evaluate("data.first=9", "overwrite=true") == 2
+    assert "no pair could be scored" in (error := capsys.readouterr().err) and "has pairs 0 to 2" in error
 
 
 def test_a_folder_of_another_run_is_an_error_that_names_the_difference(tmp_path, evaluate, capsys):
@@ -189,6 +212,8 @@ def test_a_failure_ends_a_run_but_not_a_sweep(monkeypatch):
     failures.finish([])
     with pytest.raises(failures.UnfinishedJob, match="1"):
         failures.finish([("a", "bad")])
+    with pytest.raises(SystemExit, match="130"):
+        failures.end_unfinished("stopped by Ctrl-C", 130)
 
 
 def test_the_first_line_has_the_scores_and_names_classes_with_few_points():

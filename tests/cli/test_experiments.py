@@ -14,9 +14,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cflow_torch.cli.choices import FOLDER
-from cflow_torch.cli.comparison import compare
+from cflow_torch.cli.comparison import FAILED, Comparison, compare
 from cflow_torch.cli.eval import objective
-from cflow_torch.config import Config
+from cflow_torch.config import Config, make_config
+from cflow_torch.data.json_file import write_json
 
 SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
 # Number of jobs of an experiment, and settings of the first and the last one.
@@ -70,12 +71,17 @@ def test_a_sweep_keeps_every_result_and_resumes(log_folder, tmp_path, cflow, cap
     assert len({r["data"]["digest"] for r in records}) == 1, "all settings see the same windows"
     assert not [file for file in tmp_path.rglob(".*") if file.is_file()], "no temporary file is left"
     header, *rows = csv.reader((tmp_path / "comparison.csv").read_text().splitlines())
-    assert header[:3] == ["experiment", "model.num_history", "mean dynamic error"]
-    assert [float(row[2]) for row in rows] == [objective(record["results"]) for record in records]
-    titles = "| experiment | model.num_history | mean dynamic error |"
+    assert header[:2] == ["model.num_history", "mean dynamic error"]
+    assert [float(row[1]) for row in rows] == [objective(record["results"]) for record in records]
+    titles = "| model.num_history | mean dynamic error |"
     assert capsys.readouterr().out.splitlines()[-4].startswith(titles)
 
     before = {file: file.stat().st_mtime_ns for file in files}
+    records[1]["failures"] = [["log", "bad"]]
+    files[1].write_text(json.dumps(records[1]))
+    assert FAILED in compare(tmp_path)[0]
+    with pytest.raises(SystemExit, match="1"):
+        Comparison().on_multirun_end({"output": tmp_path, "experiment_name": None})
     files[1].unlink()  # as if it had been stopped there
     assert cflow(*call) == 0
     assert capsys.readouterr().out.count("skipped, its results exist") == 1
@@ -84,24 +90,28 @@ def test_a_sweep_keeps_every_result_and_resumes(log_folder, tmp_path, cflow, cap
     assert files[0].stat().st_mtime_ns > before[files[0]]
 
 
-def test_the_comparison_sorts_jobs_by_their_settings_and_names_other_data(tmp_path, capsys):
-    def write(job: str, digest: str, text: str | None = None) -> None:
+def test_the_comparison_has_the_settings_in_which_jobs_differ_and_names_other_data(tmp_path, capsys):
+    def write(job: str, digest: str, model: Config, **config: Any) -> None:
         results = {"bucketed": {"mean": {"dynamic_error": 0.5}}, "three_way": {"epe_fd": 0.25, "epe_bs": None}}
-        record = {"results": results, "seconds_per_pair": {"median": 2.0}, "data": {"digest": digest}}
+        record = {"results": results, "seconds_per_pair": {"median": 2.0}, "data": {"digest": digest}, "failures": []}
+        settings = {"output": job, "model": model.as_dict(), "definition": "av2", **config}
         (tmp_path / job).mkdir(parents=True)
-        (tmp_path / job / "results.json").write_text(text or json.dumps(record))
+        write_json(tmp_path / job / "results.json", {**record, "config": settings})
 
-    for job in ("model.num_history=10,model.pixel_sizes=[0.2,0.1]", "model.num_history=2", "data.root=/a/b"):
-        write(job, "x")
+    paper = make_config("paper")
+    write("model.num_history=10", "x", paper.replace(num_history=10, pixel_sizes=(0.2, 0.1)))
+    write("model.num_history=2", "x", paper.replace(num_history=2))
     scores = [0.5, 0.25, 2.0]
     header, rows = compare(tmp_path)
-    names = ["data.root", "model.num_history", "model.pixel_sizes"]
+    names = ["model.pixel_sizes", "model.num_history"]
     assert header == [*names, "mean dynamic error", "EPE FD [m]", "seconds a frame"]
-    assert rows == [["", "2", "", *scores], ["", "10", "[0.2,0.1]", *scores], ["/a/b", "", "", *scores]]
-    write("a_copy", "y")
-    write("old", "y", "{}")
+    assert rows == [["[0.1]", "2", *scores], ["[0.2, 0.1]", "10", *scores]]
+    write("model=live,definition=mos", "y", make_config("live"), definition="mos")
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "results.json").write_text("{}")
     header, rows = compare(tmp_path)
-    assert header[0] == "job" and rows[-1][:5] == ["a_copy", "", "", "", "y"] and "scored data" in header
+    assert header[:5] == ["model", *names, "definition", "scored data"]
+    assert rows[0][:5] == ["live", "[0.4, 0.2, 0.1]", "4", "mos", "y"] and rows[1][0] == rows[2][0] == "paper"
     assert "old/results.json is not compared" in capsys.readouterr().out
 
 

@@ -12,6 +12,7 @@ from small_logs import make_small_drive, write_small_log
 
 from cflow_torch.cli import flow
 from cflow_torch.data.arrays import write_array_log
+from cflow_torch.data.json_file import read_json
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.fleet.progress import show_warnings_as_lines
 
@@ -65,6 +66,8 @@ def test_flow_touches_only_the_logs_of_its_run(drives, tmp_path, cflow, capsys):
     assert cflow(*call, drives[1], "model.connectivity=4") == 0, "another method, another log"
     assert cflow(*call, drives[0], "model.connectivity=4") == 2
     assert "drive_1 has results of another run (method.connectivity was 8, is 4)" in capsys.readouterr().err
+    assert cflow(*call, drives[0], "overwrite=true", "device=cuda:99") == 2
+    assert "device=cuda:99 cannot be used" in capsys.readouterr().err
     assert cflow(*call, drives[1], "overwrite=true") == 0
     assert times(tmp_path / "out" / "drive_1") == first
     assert cflow(*call, *drives) == 0
@@ -121,13 +124,13 @@ def test_clean_removes_nothing_that_it_has_not_written(tmp_path, cflow, capsys):
 
 
 @pytest.mark.parametrize("command", ["flow", "clean", "eval"])
-@pytest.mark.parametrize("content", ["name: mine\n", "{", "- 1\n"])
-def test_a_config_of_another_program_is_not_replaced(command, content, drives, tmp_path, cflow, capsys):
+@pytest.mark.parametrize("content", ["name: mine\n", "{", "- 1\n", "command: demo\nversions: {cflow_torch: 1}\n"])
+def test_a_config_of_another_program_or_command_is_not_replaced(command, content, drives, tmp_path, cflow, capsys):
     config = tmp_path / "out" / "config.yaml"
     config.parent.mkdir()
     config.write_text(content)
     assert cflow(command, *SMALL, drives[0], f"output={config.parent}", "overwrite=true") == 2
-    assert "is not a record of cflow" in capsys.readouterr().err and config.read_text() == content
+    assert f"is not a record of `cflow {command}`" in capsys.readouterr().err and config.read_text() == content
 
 
 def test_clean_names_a_second_log_of_a_name(drives, tmp_path, cflow, capsys):
@@ -148,6 +151,9 @@ def test_a_run_whose_tracks_fail_names_them_and_not_its_frames(drives, tmp_path,
     call = ("flow", "data.check=false", drives[0], f"output={tmp_path / 'out'}", "engine.workers=1")
     assert cflow(*call, "model.num_history=0", "model.point_cloud_range=[-9,-9,-inf,9,9,inf]", "tracks=true") == 1
     assert capsys.readouterr().err.endswith("missing:\n  drive_1: no room\n")
+    report = read_json(tmp_path / "out" / "reports" / "shard-0-of-1.json")
+    assert (report["status"], report["exit_status"]) == ("incomplete", 1)
+    assert report["failures"] == [["drive_1", "no room"]] and report["frames"]["failed"] == 0
 
 
 def test_a_run_without_a_frame_claims_nothing(drives, tmp_path, cflow):

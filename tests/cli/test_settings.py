@@ -121,7 +121,19 @@ def test_a_wrong_preset_is_one_line(text, message, mine, cflow, capsys):
 
 @pytest.mark.parametrize(
     "name",
-    ["10203656353524179475_7625_000_7645_000", "1e5", "2024_11_22", "-1.5", "true", "a_1", "Ausgänge/東京", 'it\'s "ü"']
+    [
+        "10203656353524179475_7625_000_7645_000",
+        "1e5",
+        "2024_11_22",
+        "-1.5",
+        "true",
+        "a_1",
+        "/a/b-c.d",
+        "x y",
+        "NaN",
+        "Ausgänge/東京",
+        'it\'s "ü"',
+    ]
     + ["a (1)", "x=y", "s3://bucket/a", "C:\\data", "C:\\data\\", '\\\\host\\a \\"b\\\\', "50%", "a#b"],
 )
 def test_names_are_text_even_if_they_look_like_numbers(name):
@@ -136,8 +148,8 @@ def test_hydra_syntax_in_names_keeps_its_meaning(compose):
 
     cfg = compose("plot", *words("log=null", "output=${device}"))
     assert cfg.log is None and cfg.output == "auto"
-    assert words("-m", "log=1_0,b,2_0", "pair=1,2") == ['log="1_0","b","2_0"', "pair=1,2"]
-    assert words("log=[a,b]", "log=a,b") == ["log=[a,b]", 'log="a","b"']
+    assert words("-m", "log=1_0,b,2_0", "pair=1,2") == ['log="1_0",b,"2_0"', "pair=1,2"], "a job's folder has no quotes"
+    assert words("log=[a,b]", "log=a,NaN") == ["log=[a,b]", 'log=a,"NaN"']
     assert words("log=choice(a,b)", "log='1_0'") == ["log=choice(a,b)", "log='1_0'"]
 
 

@@ -21,6 +21,7 @@ from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import window
 from cflow_torch.fleet import work
 from cflow_torch.fleet.job import Shard, find_shard
+from cflow_torch.fleet.manifest import claim_log
 
 OTHER = {"config": make_config("paper", pixel_size=0.8)}  # settings of another run
 
@@ -84,22 +85,21 @@ def test_incomplete_files_are_computed_again(fleet, single, out):
     assert tree(out) == single
 
 
-def test_frames_without_a_manifest_are_never_taken_as_results_of_a_run(fleet, single, out, monkeypatch):
-    for file in frames(out):  # flow of other settings, as `cflow demo` writes it
-        file.write_bytes(b"ARROW1 of another method ARROW1")
+@pytest.mark.parametrize("manifest", [None, b"", b"[]", b'{"run": {}}'])
+def test_files_that_no_manifest_of_ours_describes_stay(fleet, out, manifest):
+    """Flow of `cflow demo`, or raw clouds where the output is the parent of the drive."""
+    for file in frames(out):
         file.with_name("manifest.json").unlink(missing_ok=True)
-
-    def stop_after_the_first(*arguments: Any) -> None:
-        patch.setattr(work, "write_flow", write)  # a frame that has begun would send the signal again
-        write(*arguments)
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    with monkeypatch.context() as patch:
-        write = work.write_flow
-        patch.setattr(work, "write_flow", stop_after_the_first)
-        assert run(fleet, out, batch=1)["status"] == "interrupted"
-    assert run(fleet, out)["status"] == "complete"
-    assert tree(out) == single
+        if manifest is not None:
+            file.with_name("manifest.json").write_bytes(manifest)
+    before = tree(out)
+    for overwrite in (False, True):
+        with pytest.raises(CFlowError, match=f"{frames(out)[0].parent} has files that no manifest.json of cflow"):
+            run(fleet, out, overwrite=overwrite)
+    for folder in {file.parent for file in frames(out)}:
+        with pytest.raises(CFlowError, match="has files that no manifest.json of cflow"):
+            claim_log(folder, {"run": {}})
+    assert tree(out) == before
 
 
 def test_other_settings_are_rejected_by_name(fleet, single, out):
@@ -111,12 +111,6 @@ def test_other_settings_are_rejected_by_name(fleet, single, out):
         run(fleet, out, settings={"settings": {"find_ground": "grid"}})
     with pytest.raises(CFlowError, match="remove that folder"):
         run(fleet, out, shard=Shard(0, 2), overwrite=True, settings=OTHER)
-    manifest = frames(out)[0].with_name("manifest.json")
-    before = manifest.read_bytes()
-    manifest.write_bytes(b"")
-    with pytest.raises(CFlowError, match=f"{manifest} is not a manifest.*remove that folder"):
-        run(fleet, out)
-    manifest.write_bytes(before)
     assert run(fleet, out)["frames"]["computed"] == 0
     assert tree(out) == single, "nothing was touched"
 
@@ -177,6 +171,7 @@ def test_a_sweep_over_shards_shares_one_folder(fleet, single_run, tmp_path):
     assert command("-m", f"data.root={fleet}", f"output={tmp_path}", "shard.count=2", "shard.index=0,1") == 0
     reports = [json.loads(file.read_text()) for file in sorted((tmp_path / "reports").iterdir())]
     assert [report["exit_status"] for report in reports] == [0, 0]
+    assert "\nshard:" not in (tmp_path / "config.yaml").read_text(), "a run of this file computes all frames"
     assert flow_files(tmp_path) == flow_files(single_run)
 
 

@@ -184,7 +184,7 @@ def count(events: Iterator[Event], parts: Sequence[Part]) -> Counters:
 
 AGAIN_DIED = (
     "its worker died again (SIGSEGV): "
-    "give fewer engine.workers if memory is short, or a larger engine.timeout if a frame takes longer"
+    "give fewer engine.workers if memory is short, or a larger engine.timeout if a batch takes longer"
 )
 AGAIN = "a worker died (SIGSEGV): its frames are tried again, one by one"
 
@@ -194,6 +194,11 @@ def test_a_worker_keeps_the_memory_that_it_frees(tmp_path, monkeypatch):
     monkeypatch.setattr(work, "keep_freed_memory", lambda: calls.append(1))
     work.make_worker(make_job(tmp_path), "cpu").close()
     assert len(calls) == 1, "once per process, not per part or window"
+
+
+def test_the_memory_of_workers_on_a_gpu_is_not_limited(tmp_path):
+    with pytest.raises(CFlowError, match="engine.memory is for workers on a CPU"):
+        parallel.local_executors(make_job(tmp_path), ["cuda:0"], memory=8e9).__enter__()
 
 
 def test_when_a_worker_dies_each_of_its_frames_is_tried_by_itself(fleet, single, tmp_path):

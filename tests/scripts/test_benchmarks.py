@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from small_logs import make_small_drive
 
 from cflow_torch import CorrelationFlow, Sweep, VerifiedFlow, Window, make_config
+from cflow_torch.config import PRESETS
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
 
@@ -221,6 +222,13 @@ def test_every_step_can_be_left_out(script: Any, monkeypatch: pytest.MonkeyPatch
             setattr(model, step, replacement)
         car = 0.1 * torch.cartesian_prod(torch.arange(45.0), torch.arange(18.0), torch.arange(15.0)) + 5.05
         assert model([Window(Sweep(car), Sweep(car + torch.tensor([0.5, 0.0, 0.0])))])[0].residual_flow.any()
+
+
+def test_every_preset_has_the_history_and_the_region_of_a_set(script: Any) -> None:
+    run = script("ablation", "run")
+    for preset in PRESETS:
+        config = make_config(preset, **run.of_set(preset, 2, 35.0))
+        assert config.num_history in (0, 2) and config.point_cloud_range[3] == 35.0
 
 
 def test_a_step_of_a_model_can_be_replaced() -> None:

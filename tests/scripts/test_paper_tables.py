@@ -15,13 +15,15 @@ CLASSES = ("CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU")
 SCALES = [(0.1,), (0.2, 0.1), (0.4, 0.2, 0.1), (0.8, 0.4, 0.2, 0.1), (0.8, 0.4, 0.3, 0.2, 0.1)]
 PAPER = make_config("paper")
 KEYS = make_config("paper_keypoints")
+CLUSTERS = KEYS.replace(densify="clusters")
+PRESET = make_config("keypoints", point_cloud_range=KEYS.point_cloud_range)
 # Settings of the rows of each table, in the paper's order.
 JOBS: dict[str, list[Config]] = {
     "pixel_size": [PAPER.replace(pixel_size=size) for size in (0.05, 0.1, 0.2, 0.4)],
     "views": [PAPER, PAPER.replace(sectional_view=True)],
     "clustering": [PAPER, PAPER.replace(clustering="hdbscan")],
-    "keypoints": [KEYS, KEYS.replace(densify="nearest"), PAPER, PAPER.replace(num_history=4)],
-    "history": [PAPER.replace(num_history=h) for h in range(10)],
+    "keypoints": [KEYS, KEYS.replace(densify="nearest"), PAPER, PAPER.replace(num_history=4), CLUSTERS, PRESET],
+    "history": [*(PAPER.replace(num_history=h) for h in range(10)), make_config("default", num_history=12)],
     "scales": [PAPER.replace(num_history=h, pixel_sizes=sizes) for h in (0, 2, 4) for sizes in SCALES],
     "datasets": [PAPER, KEYS],
     "range_split": [PAPER, KEYS],
@@ -75,6 +77,9 @@ def test_tables_have_the_papers_numbers_next_to_ours(tmp_path: Path, script: Any
     views = table(tmp_path, "views")
     assert views[2][1:] == ["small", "0.1000", "0.1100", "0.1200", "0.1300", "0.1150", "0.3125"]  # correlate + pool
     assert views[4][1:] == ["small", "+0.1000", "+0.1000", "+0.1000", "+0.1000", "+0.1000", "+0.0000"]
+    added = ["Clusters (not in the paper)", "Preset keypoints (not in the paper)"]
+    assert [row[0] for row in table(tmp_path, "keypoints")[-2:]] == added
+    assert table(tmp_path, "history")[-1][:3] == ["h=12", "small", "1.1000"]
     assert table(tmp_path, "datasets")[-2][:5] == ["Overall", "ours", "0.2000", "-", "0.3000"]
     assert [row[4] for row in table(tmp_path, "range_split")[-2:]] == ["0.2000", "0.4000"]
     page = (tmp_path / "paper.md").read_text()

@@ -87,7 +87,7 @@ def plan_log(log: Log, listed: Mapping[str, Sequence[str]] | None = None) -> lis
 
     `listed` maps log ids to the names of exactly the frames to submit. None = the sweeps that have an evaluation
     mask if the log has any, else the pairs 0, 5, 10 ... The last sweep is left out, because it has no successor;
-    OpenSceneFlow writes no file for it either.
+    OpenSceneFlow writes no file for it either. A pair over a gap stays, because the server expects its file.
     """
     safe_name(log.log_id, "the log")
     pairs = range(len(log.timestamps) - 1)
