@@ -20,7 +20,8 @@ from cflow_torch.applications.cleaning import MaskedLog, static_map_with_intensi
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, copy_rows, read_cloud, write_cloud
 
-FAST = ("model.num_history=0", "model.pixel_sizes=[0.4,0.2]")
+NEAR = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
+FAST = ("model.num_history=0", "model.pixel_sizes=[0.4,0.2]", NEAR)
 DRIVE = Staged([straight((1, 1), (0.9, 0.0), 4)])
 NAMES = [f"scan_{1700000000 + index}.{index}00" for index in range(4)]  # seconds with decimals
 

@@ -46,14 +46,15 @@ def evaluate(cflow: Callable[..., int], log_folder: Path, tmp_path: Path) -> Cal
 def test_demo_writes_all_its_files(tmp_path, cache, cflow, capsys, monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
-    assert cflow("demo", f"output={tmp_path}", "data.num_sweeps=2", "pair=0", "model.num_history=0", SMALL) == 0
+    model = ("model.num_history=0", "model.pixel_sizes=[0.4,0.2]", SMALL)
+    assert cflow("demo", f"output={tmp_path}", "data.num_sweeps=2", "pair=0", *model) == 0
     (log,) = (AV2Log(folder) for folder in cache.glob("*-2/*/*"))
     assert [file.stem for file in (tmp_path / log.log_id).iterdir()] == [str(log.timestamps[0])]
     scores = results_of(tmp_path)
     assert scores["results"]["num_frames"] == 1 and 0 < scores["results"]["three_way"]["epe_fd"] < 2
     left: Any = OmegaConf.to_container(OmegaConf.load(tmp_path / "config.yaml").model)
     region = (-20.0, -20.0, -np.inf, 20.0, 20.0, np.inf)
-    assert Config.of(left) == make_config(num_history=0, point_cloud_range=region)
+    assert Config.of(left) == make_config(num_history=0, pixel_sizes=(0.4, 0.2), point_cloud_range=region)
     assert (tmp_path / "flow.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
     assert re.search("^mean dynamic error 0[.]", printed, re.MULTILINE)  # Python 3.8 has no k3d, which is said before
