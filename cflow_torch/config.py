@@ -69,7 +69,7 @@ class Config(Settings):
     )
     max_memory: Optional[float] = setting(
         None,
-        "bytes of working memory that the method may plan with. None = no limit on a GPU, 512 MiB on a CPU",
+        "bytes of working memory that the method may plan with. None = half of a GPU's free memory, 512 MiB on a CPU",
         kind=float,
         optional=True,
         above=0,

@@ -69,7 +69,8 @@ class SceneFlowModel(nn.Module):
 
     Args:
         config: settings of the method; `from_preset` makes them from a preset.
-        device: "auto" = the device of the tensors, else a GPU if there is one, else the CPU.
+        device: "auto" = the device of the tensors, else a GPU if there is one, else the CPU. `model.to(device)` does
+            not change it, because a method has no weights.
 
     Raises:
         CFlowError: `config` is not a `Config`, or it is the config of another method.
@@ -177,7 +178,7 @@ class SceneFlowModel(nn.Module):
 
 
 def _results(batch: Batch, motion: Motion) -> list[FlowResult]:
-    """One result per window, for all rows of its pc0. The results share memory with each other."""
+    """One result per window, for all rows of its pc0."""
     points = slice(batch.rows[0].start, batch.rows[-1].stop)
     cluster = motion.cluster(points)
     is_valid = batch.has_result[points].clone()
@@ -190,5 +191,10 @@ def _results(batch: Batch, motion: Motion) -> list[FlowResult]:
     ]
     columns = (residual, batch.pose_flow, residual + batch.pose_flow, cluster_id, score, is_valid, *probabilities)
     sizes = [rows.stop - rows.start for rows in batch.rows]
-    of_window = [[None] * len(sizes) if column is None else column.split(sizes) for column in columns]
+    of_window = [[None] * len(sizes) if column is None else _divided(column, sizes) for column in columns]
     return [FlowResult(*fields) for fields in zip(*of_window)]
+
+
+def _divided(values: Tensor, sizes: list[int]) -> list[Tensor]:
+    """Divide rows into copies, so that a result that you keep or pickle does not hold the whole batch."""
+    return [values] if len(sizes) == 1 else [part.clone() for part in values.split(sizes)]

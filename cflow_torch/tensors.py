@@ -75,9 +75,7 @@ def read_point_times(sweep: Sweep, name: str, interval: float | None, device: to
     """
     if interval is None:
         return torch.zeros(sweep.points.shape[0], dtype=torch.float64, device=device)
-    given = sweep.point_times
-    times = given.detach() if isinstance(given, Tensor) else torch.from_numpy(np.array(given, dtype=np.float64))
-    times = times.to(device, torch.float64)
+    times = float64_tensor(sweep.point_times, device)
     if not bool((times.abs() <= _LONGEST_TIME).all()):  # False for NaN
         raise CFlowError(
             f"point times of {name} are not all finite and within {_LONGEST_TIME:g} s of 0: give seconds after the "
@@ -86,6 +84,12 @@ def read_point_times(sweep: Sweep, name: str, interval: float | None, device: to
     # A GPU multiplies by the reciprocal of a plain number, which rounds differently.
     times = times / times.new_full((1,), interval)
     return torch.floor(times * _TICKS + 0.5) / _TICKS
+
+
+def float64_tensor(values: Any, device: torch.device) -> Tensor:
+    """Return values as float64 on a device; arrays of any dtype, byte order and strides are copied."""
+    given = values.detach() if isinstance(values, Tensor) else torch.from_numpy(np.array(values, dtype=np.float64))
+    return given.to(device, torch.float64)
 
 
 def resolution(dtype: Any, distance: float) -> float:

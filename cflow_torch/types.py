@@ -97,8 +97,10 @@ def as_numpy(value: Array, dtype: Any | None = None) -> np.ndarray:
 def point_rows(name: str, values: Array, count: int | None = None) -> np.ndarray:
     """Check an array with a row per point, and return it as (N, 3) float64. `count` is N; None = any N."""
     array = as_numpy(values)
+    wanted = "(N, 3)" if count is None else f"({count}, 3)"
+    if array.dtype == object:
+        raise CFlowError(f"{name} is {type(values).__name__}: give an array {wanted}, such as sweep.points")
     if array.ndim != 2 or array.shape[1] < 3 or (count is not None and len(array) != count):
-        wanted = "(N, 3)" if count is None else f"({count}, 3)"
         raise CFlowError(f"{name} has shape {array.shape}: give {wanted}, one row per point")
     return array[:, :3].astype(np.float64)
 
@@ -279,8 +281,8 @@ class FlowResult:
         residual_flow: (N, 3) float32, metres per sweep interval, axes of ego1: motion of objects.
         pose_flow: (N, 3) float32, metres, T_ego1_ego0 p - p: apparent motion that ego motion alone causes.
         flow: (N, 3) float32, metres, total flow, the sum of the two.
-        cluster_id: (N,) int64, 0 ... M-1 in the order of each cluster's first pixel; -1 = in no cluster that has
-            points both at t+1 and before.
+        cluster_id: (N,) int64, numbers from 0 on, in the order of each cluster's first pixel, some of which may be
+            skipped; -1 = in no cluster that has points both at t+1 and before.
         score: (N,) float32 in [0, 1], normalised cross-correlation of the cluster with t+1 at the peak (finest scale;
             verified method: scale of the object). It is not a probability. It is 0 where cluster_id is -1, and in
             the verified method for objects that no candidate moves.

@@ -107,15 +107,11 @@ class TinyRecording:
                     column=np.arange(count, dtype=np.int32),
                     offset_ns=self._offset_us[unit] * 1000,
                     intensity=np.arange(count).astype(np.uint8),
-                    radial_velocity=np.zeros(count, np.float32),
-                    num_rings=32,
+                    elevations=np.linspace(-0.5, 0.2, 32),
                     num_columns=count,
                 )
             )
         return result
-
-    def elevations(self, unit: str) -> np.ndarray:
-        return np.linspace(-0.5, 0.2, 32)
 
     def boxes(self, index: int) -> Boxes:
         world = np.stack([self.car_at(self.timestamps[index]), self.parked()])

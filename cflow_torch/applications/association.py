@@ -45,8 +45,8 @@ def regroup(groups: MovingGroups, tracks: TrackStates) -> MovingGroups:
 def of_own_vehicle(groups: MovingGroups, sweeps: Window) -> Tensor:
     """Tell which points of sweep t belong to moving groups that are returns of its own vehicle, (M,) bool.
 
-    The origin of the vehicle is inside of it, and cannot be inside another object. Near the vehicle, a group is also
-    its own if it moves as the vehicle does, faster than people walk. Without poses, we cannot tell.
+    They move as the vehicle does, and are around its origin, or near the vehicle if it drives faster than people walk.
+    Another vehicle beside it may seem to be around the origin, too. Without poses, we cannot tell.
     """
     if sweeps.pc0.pose is None or sweeps.pc1.pose is None:
         return torch.zeros_like(groups.moves)
@@ -60,9 +60,9 @@ def of_own_vehicle(groups: MovingGroups, sweeps: Window) -> Tensor:
     motion = T_world_ego1 @ torch.linalg.inv(T_world_ego0)
     ride = centre @ motion[:3, :3].T + motion[:3, 3] - centre  # of a point that is fixed to the vehicle
     distance = ride.norm(dim=1)
-    rides = ((flow - ride).norm(dim=1) <= _RIDE_ERROR * distance) & (distance >= _LEAST_RIDE)
+    rides = (flow - ride).norm(dim=1) <= _RIDE_ERROR * distance
     is_near = (offset + size[:, :2] / 2).norm(dim=1) <= _REACH
-    is_own = holds_origin | rides & is_near
+    is_own = rides & (holds_origin | is_near & (distance >= _LEAST_RIDE))
     return Groups(groups.group, len(is_own)).where(groups.moves).spread(is_own)
 
 

@@ -56,9 +56,10 @@ def write_clean_log(
         replace: replace an older folder when this one is complete; else an older one is a `CFlowError`.
 
     Convention: a mask has (N,) bool for the points of the sweep of `log`, True = not in the clean cloud. If the log is
-        a folder of clouds with the same suffix, clouds keep their names, columns, types and VIEWPOINT, and the points
-        their stored numbers: they are not de-skewed, and in the world's frame if they were. They are read again with
-        the same settings. Otherwise, points are in the ego frame, as the log has them.
+        a folder of clouds with the same suffix, compressed or not, clouds keep their names, columns, types and
+        VIEWPOINT, and the points their stored numbers: they are not de-skewed, and in the world's frame if they were.
+        Otherwise, points are in the ego frame, as the log has them. All other readings, such as `read_as=inverted` or
+        `points_feet`, are applied: read the output without them.
     """
     suffix = own_suffix(log) if suffix is None else suffix
     if suffix.lower() not in SUFFIXES:
@@ -122,7 +123,7 @@ def stored_masks(folder: Path, log: Log) -> Callable[[int], np.ndarray]:
 def _keeps_form(log: Log, suffix: str) -> bool:
     """Test whether the numbers of points in the files of a folder of clouds can stay as they are."""
     own = log.unwrapped
-    if not isinstance(own, ArraysLog) or own.files[0].suffix.lower() != suffix.lower():
+    if not isinstance(own, ArraysLog) or suffix_of(own.files[0]) != suffix.lower():
         return False
     return np.array_equal(own.ego_T_lidar, np.eye(4)) and set(OF_POINTS).isdisjoint(log.readings)
 

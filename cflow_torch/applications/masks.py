@@ -56,8 +56,8 @@ def check_cameras(log: Log, cameras: Sequence[Camera]) -> None:
     """Raise an error if a log has no calibrated cameras."""
     if not cameras:
         raise CFlowError(
-            f"log {log.log_id} has no calibration of cameras, which masks need: Argoverse 2, PandaSet, nuScenes and "
-            "KITTI have it in the files of their cameras"
+            f"log {log.log_id} has no calibration of cameras, which masks need: Argoverse 2, PandaSet, nuScenes, "
+            "TruckScenes and KITTI have it in the files of their cameras"
         )
 
 

@@ -12,7 +12,7 @@ from cflow_torch.applications.association import turned
 from cflow_torch.applications.missed_sweeps import SweepTracks
 from cflow_torch.applications.moving_groups import MIN_POINTS
 from cflow_torch.applications.track_table import Table
-from cflow_torch.applications.whole_boxes import RUNNING
+from cflow_torch.applications.whole_boxes import RUNNING, quantiles_of_axes
 from cflow_torch.ops.labeling import connected_components
 from cflow_torch.ops.nearest import nearest_set_pixel
 from cflow_torch.types import CENTRE
@@ -79,9 +79,8 @@ def people(points: Tensor, sweep: Tensor) -> Tensor:
     """
     part = _parts(points[:, :2])
     count = int(part.max()) + 1
-    of_part = [points[part == number] for number in range(count)]
-    middle = torch.stack([each.quantile(0.5, 0) for each in of_part])
-    length, width, height = torch.stack([each.quantile(0.95, 0) - each.quantile(0.05, 0) for each in of_part], 1)
+    low, middle, high = quantiles_of_axes(points, part, count, 0.05, 0.5, 0.95)  # (count, 3) each
+    length, width, height = (high - low).unbind(1)
     if count == 1 or height.min() < _LEAST_HEIGHT or torch.pdist(middle[:, :2]).min() < _LEAST_DISTANCE:
         return torch.zeros_like(part)
     num_sweeps = torch.stack([(torch.bincount(sweep[part == k]) >= MIN_POINTS).sum() for k in range(count)])

@@ -17,7 +17,7 @@ from cflow_torch.diagnosis.inspection import Inspection
 from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
 from cflow_torch.ground.segmentation import GROUND_METHODS, find_ground
-from cflow_torch.tensors import choose_device, read_ground, read_positions
+from cflow_torch.tensors import choose_device, float64_tensor, read_ground, read_positions
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.collation import make_batch
 from cflow_torch.windows.returns import MISSING, without_missing
@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 class FlowStream:
     """Push sweeps one after the other; get the flow of a sweep as soon as the next one arrives.
 
-    A stream keeps the last `num_history` + 2 sweeps on the device of the method, and the map of KISS-ICP if it
+    A stream keeps the last `num_history` + 2 sweeps on the device of the method, and the newest points if it
     estimates poses. A result is equal, bit for bit, to that of `make_model(config)([window])` with these sweeps.
 
     Args:
@@ -126,6 +126,15 @@ class FlowStream:
             given = points
         else:
             given = Sweep(points, is_ground, pose, None if time is None else _nanoseconds(time), point_times)
+        state = (self._sweeps.copy(), self._odometry, self.window)
+        try:
+            return self._add(given)
+        except BaseException:
+            self._sweeps, self._odometry, self.window = state
+            raise
+
+    def _add(self, given: Sweep) -> FlowResult | None:
+        """Add a sweep, see `push`. An error may leave a part of the stream changed."""
         if not self._accepts(given.timestamp_ns):
             return None
         sweep = self._prepare(given)
@@ -182,7 +191,7 @@ class FlowStream:
             is_ground = find_ground(points, self._ground)
             self._tell_ground(is_ground)
         if times is not None:
-            times = torch.as_tensor(times).to(device, copy=True)
+            times = float64_tensor(times, device).clone()  # the caller may use a tensor again
         if pose is None:
             self._odometry = self._odometry or Odometry()
             pose = self._odometry.next_pose(as_numpy(points), "the sweep")

@@ -128,9 +128,9 @@ class Tracker:
         sweeps = sweeps if isinstance(sweeps, Window) else Window(*sweeps)
         if any(getattr(result, name) is None for name in ("residual_flow", "cluster_id", "is_valid")):
             raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
+        groups = MovingGroups.of(sweeps, result)
         self.times = self._times(sweeps)
         self.floor = Floor.of(sweeps.pc0)
-        groups = MovingGroups.of(sweeps, result)
         groups = groups.divide(torch.where(of_own_vehicle(groups, sweeps), -1, 0))
         tracks, points = self._predict(self.times, groups.point.device)
         groups = regroup(groups, tracks)
@@ -411,9 +411,9 @@ class LogTracker:
         """Continue the tracks by the flow of sweep `index`; indices ascend."""
         if self._after != index:
             self._find_after()
-        self._after = index + 1
         sweeps = window(self._log, index)
         table, track_id = self._tracker.push(sweeps, result)
+        self._after = index + 1
         if _is_after_pause(self._tracker.times):
             for each in self._sweeps[-_MAX_MISSED:]:
                 each.free = None  # new tracks were not there

@@ -76,9 +76,7 @@ class Edges(NamedTuple):
         local = turned(points, -heading[row])
         count = len(heading)
         shares = (_STRAY, 1 - _STRAY, 0.5)
-        low, high, median = torch.stack(
-            [torch.stack(quantiles(local[:, axis], row, count, *shares)) for axis in range(3)], 2
-        )
+        low, high, median = quantiles_of_axes(local, row, count, *shares)
         stands = (floor <= low[:, 2]) & (floor >= low[:, 2] - _MOST_HIDDEN)
         low[:, 2] = torch.where(stands, floor, low[:, 2])
         return cls(low, high, median, turned(sensor, -heading))
@@ -268,6 +266,11 @@ def quantiles(values: Tensor, group: Tensor, count: int, *shares: float) -> list
         value = values[order[position.clamp(max=len(values) - 1)]]
         found.append(torch.where(size > 0, value, torch.nan))
     return found
+
+
+def quantiles_of_axes(points: Tensor, group: Tensor, count: int, *shares: float) -> Tensor:
+    """Quantiles of the (N, 3) points of each group along each axis, (shares, count, 3), see `quantiles`."""
+    return torch.stack([torch.stack(quantiles(points[:, axis], group, count, *shares)) for axis in range(3)], 2)
 
 
 def _means(values: Tensor, group: Tensor, count: int) -> Tensor:

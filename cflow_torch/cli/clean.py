@@ -21,6 +21,7 @@ from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import read_json, write_json
 from cflow_torch.data.log import Log
+from cflow_torch.data.paths import suffix_of
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.manifest import describe_log
@@ -28,6 +29,7 @@ from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
 
 MAP_FILE = "map.ply"  # next to its picture, map.png
+_APPLIED = ("read_as", "poses_of", "ego_T_lidar")  # settings of the data that clean clouds and their poses contain
 _NEEDED = ("residual_flow", "cluster_id", "is_valid", "moving")  # of flow files; remove_stopped needs confidence, too
 
 
@@ -47,7 +49,7 @@ def task(cfg: Clean) -> None:
             if log.log_id not in is_written:
                 raise CFlowError(f"{folder} has another log of this run: rename one of two logs of this name")
             removed = "it is complete" if is_written.pop(log.log_id) else _write(cfg, log, output, clean)
-            print(f"{folder}: {len(log.timestamps)} sweeps, {removed}{_how_to_read(log, cfg.suffix)}")
+            print(f"{folder}: {len(log.timestamps)} sweeps, {removed}{_how_to_read(cfg, log)}")
             if cfg.map and not _has_map(cfg, folder):
                 print(_write_map(cfg, log, folder))
     finish(failures)
@@ -118,16 +120,18 @@ def _write_map(cfg: Clean, log: Log, folder: Path) -> str:
     return f"{file}: {len(points):,} points{_draw(points, log.log_id, file.with_suffix('.png'))}"
 
 
-def _how_to_read(log: Log, suffix: str | None) -> str:
-    """Return the setting that reads `.bin` files of several columns."""
+def _how_to_read(cfg: Clean, log: Log) -> str:
+    """Return which settings read the clean log: that of `.bin` files of several columns, and none that is applied."""
+    how = [f"without data.{name}" for name in _APPLIED if cfg.data.get(name) not in (None, "auto")]
     own = log.unwrapped
-    if (suffix or own_suffix(log)).lower() != ".bin":
-        return ""
-    if isinstance(own, ArraysLog) and own.files[0].suffix.lower() == ".bin" and own.bin_layout is not None:
-        columns = own.bin_layout.columns
-    else:
-        columns = max(3 + len(log.columns(0)), KITTI_COLUMNS)
-    return "" if columns == KITTI_COLUMNS else f"; read them with data.bin_columns={columns}"
+    if (cfg.suffix or own_suffix(log)).lower() == ".bin":
+        if isinstance(own, ArraysLog) and suffix_of(own.files[0]) == ".bin" and own.bin_layout is not None:
+            columns = own.bin_layout.columns
+        else:
+            columns = max(3 + len(log.columns(0)), KITTI_COLUMNS)
+        if columns != KITTI_COLUMNS:
+            how.append(f"with data.bin_columns={columns}")
+    return f"; read them {' and '.join(how)}" if how else ""
 
 
 def _draw(points: np.ndarray, title: str, file: Path) -> str:

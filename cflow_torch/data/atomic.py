@@ -88,16 +88,22 @@ def new_folder(root: PathLike, name: str, replace: bool = False) -> Iterator[Pat
         raise CFlowError(f"{folder} is remote: write the folder on this machine and copy it there")
     if folder.exists() and not replace:
         raise CFlowError(f"{folder} exists already: remove it, or choose another root")
-    new = folder.with_name(_temporary_name(folder.name))
+    new, older = (folder.with_name(_temporary_name(folder.name)) for _ in range(2))
     try:
         new.mkdir(parents=True)
         yield new
         for path in new.rglob("*"):
             if path.is_file():
                 _sync(path)
-        if replace:
-            shutil.rmtree(folder, ignore_errors=True)
-        os.replace(new, folder)
+        try:
+            if folder.exists():  # a folder cannot take the name of one that has files
+                os.replace(folder, older)
+            os.replace(new, folder)
+        except BaseException:
+            if older.exists() and not folder.exists():
+                os.replace(older, folder)
+            raise
+        shutil.rmtree(older, ignore_errors=True)
     finally:
         shutil.rmtree(new, ignore_errors=True)
 

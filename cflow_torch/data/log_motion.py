@@ -144,9 +144,12 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     if judgement.best and poses is not None:  # are only a few sweeps wrong?
         pairs = _pairs_without_repeats(log, poses, jumps, ()) or chosen  # all may repeat the one before
         judgement = judgement if pairs == chosen else judge(make_pairs(pairs, scans, False))
-        others = _pairs_without_repeats(log, poses, jumps, {index for pair in pairs for index in pair})
-        again = judge(make_pairs(others, scans, False)) if judgement.best and others else judgement
-        judgement = again if _contradicts(again, judgement) else judgement
+        if judgement.best:
+            others = _pairs_without_repeats(log, poses, jumps, {index for pair in pairs for index in pair})
+            prepared = [pair for pair in make_pairs(others, scans, False) if pair is not None]
+            if _fit_as_given(prepared, judgement):
+                again = judge(prepared)
+                judgement = again if _contradicts(again, judgement) else judgement
     is_unclear = not judgement.best and judgement.given < _UNCLEAR
     if poses is not None and is_unclear and _hardly_move(poses):
         spread = choose_pairs(len(log.timestamps), None)
@@ -193,13 +196,28 @@ def _pairs_without_repeats(
         excluded |= repeated
 
 
+def _fit_as_given(pairs: Sequence[Pair], judgement: Judgement) -> bool:
+    """Test whether so much of the structure of other pairs is in place as given that they may contradict a judgement.
+
+    Most do not, so we need not judge them.
+    """
+    shown = [pair for pair in pairs if pair.has_motion] or pairs
+    scans = {OFF}.union(*(pair.scans for pair in shown)) if shown else ()
+    return any(np.mean([pair.share(scan) for pair in shown]) >= _least_share(judgement) for scan in scans)
+
+
+def _least_share(judgement: Judgement) -> float:
+    """Return the share as given, from which other pairs fit clearly better than those of a judgement."""
+    return max(LEAST_SHARE, MARGIN * judgement.given)
+
+
 def _contradicts(again: Judgement, judgement: Judgement) -> bool:
     """Test whether other sweeps fit clearly better as given, and show that the best reading is wrong.
 
     Then only a few sweeps are wrong, such as one that repeats the one before. Errors of measurement differ by sweep.
     """
     shown = again.shares.get(judgement.best[0], float("nan")) if judgement.best else float("nan")
-    return not again.best and shown <= again.given and again.given >= max(LEAST_SHARE, MARGIN * judgement.given)
+    return not again.best and shown <= again.given and again.given >= _least_share(judgement)
 
 
 def _make_pairs(

@@ -131,9 +131,9 @@ def _later(by: float) -> _Convert:
             return halfway(poses, _later(np.sign(by))(poses))
         rows = np.arange(len(poses)) + int(by)
         moved = poses[rows.clip(0, len(poses) - 1)]
+        end, before = (0, 1) if by < 0 else (-1, -2)
+        step = np.linalg.inv(poses[before]) @ poses[end]
         for row in np.flatnonzero((rows < 0) | (rows >= len(poses))):
-            end, before = (0, 1) if by < 0 else (-1, -2)
-            step = np.linalg.inv(poses[before]) @ poses[end]
             beyond = -rows[row] if by < 0 else rows[row] - len(poses) + 1
             moved[row] = poses[end] @ np.linalg.matrix_power(step, int(beyond))
         return moved

@@ -145,7 +145,8 @@ def find_motion(source: np.ndarray, target: np.ndarray, turns: Sequence[float] =
     for turn in turns:
         T = as_matrix(rotations_about(2, turn))
         turned = torch.fft.rfft2(_image(source @ T[:3, :3].T, 0))
-        counts = torch.fft.irfft2(image * turned.conj(), (_CELLS, _CELLS)).round().numpy()[np.ix_(steps, steps)]
+        by_row = torch.fft.ifft(image * turned.conj(), dim=0)[steps]  # a third less work than all shifts
+        counts = torch.fft.irfft(by_row, _CELLS, dim=1)[:, steps].round().numpy()
         row, column = np.unravel_index(int(counts.argmax()), counts.shape)
         if counts[row, column] > most:  # ties: the first
             most = int(counts[row, column])

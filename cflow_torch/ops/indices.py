@@ -99,14 +99,14 @@ def lazy_zeros(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     several times as fast as `torch.zeros`.
     """
     if device.type == "cpu":
-        return torch.from_numpy(np.zeros(size, torch.empty(0, dtype=dtype).numpy().dtype))
+        return torch.from_numpy(np.zeros(size, torch.empty(0, dtype=dtype, device="cpu").numpy().dtype))
     return torch.zeros(size, dtype=dtype, device=device)
 
 
 def lazy_empty(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """(size,) undefined values, for callers that write only a small part. Cost: as for `lazy_zeros`."""
     if device.type == "cpu":
-        return torch.from_numpy(np.empty(size, torch.empty(0, dtype=dtype).numpy().dtype))
+        return torch.from_numpy(np.empty(size, torch.empty(0, dtype=dtype, device="cpu").numpy().dtype))
     return torch.empty(size, dtype=dtype, device=device)
 
 

@@ -155,10 +155,6 @@ class Drive(Log):
     def units(self, index: int) -> list[UnitReturns]:
         """Returns of each LiDAR in sweep `index`. Concatenated in this order, they match the rows of `sweep(index)`."""
         returns = self.returns(index)
-        velocity = self._motion.radial_velocity(self._seconds[index], returns)
-        if self._profile.velocity_noise:
-            noise = np.random.default_rng([self._seed, 3, index]).normal(size=len(velocity))
-            velocity = (velocity + self._profile.velocity_noise * noise).astype(np.float32)
         parts = []
         begin = 0
         counts = torch.bincount(returns.unit, minlength=len(self._profile.units)).tolist()
@@ -173,24 +169,12 @@ class Drive(Log):
                     column=returns.column[rows].numpy().copy(),
                     offset_ns=returns.offset_ns[rows].numpy().astype(np.int64),
                     intensity=returns.intensity[rows].numpy().copy(),
-                    radial_velocity=velocity[rows],
-                    num_rings=len(unit.elevations),
+                    elevations=np.radians(np.sort(np.array(unit.elevations, np.float64))),
                     num_columns=unit.num_columns,
                 )
             )
             begin += count
         return parts
-
-    def elevations(self, unit: str) -> np.ndarray:
-        """(num_rings,) float64 radians, elevation of each ring of the LiDAR named `unit`, lowest first.
-
-        Raises:
-            CFlowError: there is no LiDAR of that name.
-        """
-        for candidate in self._profile.units:
-            if candidate.name == unit:
-                return np.radians(np.sort(np.array(candidate.elevations, np.float64)))
-        raise CFlowError(f"log {self.log_id} has no LiDAR {unit!r}; it has {', '.join(self.calibration)}")
 
     def ground_raster(self) -> GroundRaster:
         """Ground height of the area within the LiDARs' range."""
@@ -276,8 +260,9 @@ def make_drive(
         >>> drive.sweep(0).points.shape == drive.labels(0).flow.shape
         True
     """
-    if seed < 0 or num_sweeps < 1:
-        raise CFlowError(f"seed must be >= 0 and num_sweeps >= 1, got seed {seed} and num_sweeps {num_sweeps}")
+    are_whole = all(isinstance(number, (int, np.integer)) for number in (seed, num_sweeps))
+    if not are_whole or seed < 0 or num_sweeps < 1:
+        raise CFlowError(f"seed={seed}, num_sweeps={num_sweeps}: give whole numbers, seed >= 0 and num_sweeps >= 1")
     lidars = in_weather(_choose("sensor profile", profile, PROFILES), *_choose("weather", weather, WEATHER))
     world = _choose("scene", scene, SCENES)(np.random.default_rng([seed, 0]))
     if lidars.has_trailer:

@@ -9,14 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.simulator.lidar import Returns
 from cflow_torch.simulator.rolling import MovingSolids, Shots
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.sensors import LidarProfile, SpinningLidar
-from cflow_torch.transforms import transform_each
 
 _NUM_INTERVALS = 4  # per sweep; poses are interpolated within each, element by element: legs are exact to 0.3 mm
-_DERIVATIVE_STEP = 1e-3  # half the interval of central differences, seconds
 
 
 class SceneMotion:
@@ -101,62 +98,6 @@ class SceneMotion:
             row=torch.from_numpy(self._row),
             dynamic=torch.from_numpy(_relative_to(dynamic, origin)),
         )
-
-    def radial_velocity(self, seconds: float, returns: Returns) -> np.ndarray:
-        """(N,) float32 m/s, speed over ground along each ray of the surface that it hit; positive = receding."""
-        row_of_hit = np.append(self._row, -1)[returns.solid.numpy()]
-        velocity = np.zeros(len(row_of_hit), np.float32)
-        rows = np.flatnonzero(row_of_hit >= 0)
-        if not len(rows):
-            return velocity
-        row_of_hit = row_of_hit[rows]
-        shot: np.ndarray = np.full(len(rows), seconds)
-        if self._profile.is_rolling:
-            shot = seconds + 1e-9 * returns.offset_ns.numpy()[rows].astype(np.float64)
-            slope = self._slopes_at(self._knots(seconds), shot, row_of_hit)
-        else:
-            slope = self._slopes(shot[:1])[0, row_of_hit]
-        sensor, point = self._ray_ends(seconds, shot, returns, rows)
-        ray = (point - sensor) / np.linalg.norm(point - sensor, axis=1, keepdims=True)
-        at_point = transform_each(point, slope)
-        velocity[rows] = (at_point * ray).sum(1)
-        return velocity
-
-    def _slopes(self, seconds: np.ndarray) -> np.ndarray:
-        """Return (T, M, 3, 4) float64: linear functions from world positions to velocities of M dynamic solids.
-
-        The velocity of a point on a rigid solid is such a function of the position of the point.
-        """
-        around = np.add.outer(seconds, (-_DERIVATIVE_STEP, 0.0, _DERIVATIVE_STEP)).ravel()
-        bodies = self._dynamic.body_poses(around)
-        poses = np.stack([self._dynamic.solids(t, p).pose.numpy() for t, p in zip(around.tolist(), bodies)])
-        before, now, after = poses.reshape(len(seconds), 3, *poses.shape[1:]).swapaxes(0, 1)
-        return (after - before)[..., :3, :] / (2 * _DERIVATIVE_STEP) @ np.linalg.inv(now)
-
-    def _slopes_at(self, knots: np.ndarray, shot: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """Interpolate `_slopes` between knots: (n, 3, 4) of the solids (n,) at the times of shots (n,)."""
-        slopes = self._slopes(knots)
-        position = (shot - knots[0]) / (knots[1] - knots[0])
-        first = np.clip(np.floor(position).astype(int), 0, len(knots) - 2)
-        weight = (position - first)[:, None, None]
-        return (1 - weight) * slopes[first, row] + weight * slopes[first + 1, row]
-
-    def _ray_ends(
-        self, seconds: float, shot: np.ndarray, returns: Returns, rows: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(n, 3) float64 each: world positions of the LiDAR at its shots, and of the points that they hit."""
-        profile = self._profile
-        stamped = self.ego_poses(np.array([seconds]))[0]
-        unit = returns.unit.numpy()[rows]
-        is_virtual = np.array([u.is_virtual for u in profile.units])[unit]
-        ego = self.ego_poses(shot)
-        ego[is_virtual] = stamped
-        mounts = np.stack([u.T_ego_sensor for u in profile.units])
-        sensor = transform_each(mounts[unit, :3, 3], ego)
-        if profile.is_deskewed:
-            ego = np.broadcast_to(stamped, ego.shape)
-        points = returns.points.numpy()[rows].astype(np.float64)
-        return sensor, transform_each(points, ego)
 
     def _knots(self, seconds: float) -> np.ndarray:
         interval = self._profile.sweep_interval_ns * 1e-9

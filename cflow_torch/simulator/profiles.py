@@ -155,7 +155,7 @@ def _aevascenes() -> LidarProfile:
         fan("rear_narrow_lidar", (-0.918, -0.297, 1.971), -179.5, (-19.6, 19.1), (-5.7, 9.8), 512.0),
         fan("left_lidar", (0.697, 0.495, 1.935), 89.5, (-57.6, 59.5), (-11.2, 9.1), 107.0),
     )
-    return LidarProfile(units, max_range=512.0, is_rolling=True, velocity_noise=0.1)
+    return LidarProfile(units, max_range=512.0, is_rolling=True)
 
 
 PROFILES: dict[str, LidarProfile] = {

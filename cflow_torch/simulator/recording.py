@@ -15,12 +15,12 @@ class UnitReturns:
         name: the unit's name in the data set, for example "LIDAR_TOP".
         T_ego_sensor: (4, 4) float64, from the unit's frame to the ego frame.
         points: (N, 3) float32, metres, frame of the UNIT; motion-compensated if the data set's points are.
-        ring: (N,) int32, row of the unit's table of elevations; row 0 is the lowest beam.
+        ring: (N,) int32, row of `elevations`.
         column: (N,) int32, index of the azimuth step, counted in the direction of rotation.
         offset_ns: (N,) int64, time from the sweep's time stamp to the shot; may be negative.
         intensity: (N,) uint8.
-        radial_velocity: (N,) float32, m/s, speed over ground of the surface along the ray; positive = receding.
-        num_rings, num_columns: size of the unit's range image.
+        elevations: (B,) float64, radians, elevation of each ring, lowest first.
+        num_columns: width of the unit's range image, whose height is B.
     """
 
     name: str
@@ -30,6 +30,5 @@ class UnitReturns:
     column: np.ndarray
     offset_ns: np.ndarray
     intensity: np.ndarray
-    radial_velocity: np.ndarray
-    num_rings: int
+    elevations: np.ndarray
     num_columns: int

@@ -75,7 +75,6 @@ class LidarProfile:
         is_deskewed: the ego motion between each shot and the time stamp is compensated. Only for rolling profiles.
         ego_height: height of the ego frame's origin above the ground, metres.
         has_trailer: the vehicle is an articulated truck; returns from the truck itself are lost.
-        velocity_noise: standard deviation of the radial velocity, m/s.
         extinction: extinction coefficient of the air, 1/m.
     """
 
@@ -91,5 +90,4 @@ class LidarProfile:
     is_deskewed: bool = True
     ego_height: float = 0.35
     has_trailer: bool = False
-    velocity_noise: float = 0.0
     extinction: float = 0.0

@@ -29,7 +29,7 @@ PRICE = 4 * PER_SLICE
 
 @dataclass(frozen=True)
 class Objects:
-    """The selected objects, in order of window and of their first pixel in the list: those of copies come last."""
+    """The selected objects, in order of their first pixel in the list: those of copies come last."""
 
     by_object: Groups  # the P' pixels
     by_node: Groups  # the G objects, by the node whose motion they take; static objects are in no group
@@ -144,10 +144,10 @@ def _moving_nodes(tree: Tree, of_level: Tensor, evidence: Tensor, left: Tensor) 
     own = evidence.index_select(0, node)
     has_more = own > F.pad(evidence, (0, 1)).index_select(0, rival)  # of none, 0
     wins = has_more | (left.index_select(0, node) == rival)
-    # The largest key is that of the node with the most evidence. Ties: the first.
-    key = torch.where(wins, (own + 1) * none - 1 - node, -1)
-    key = Groups(pixel, len(of_level)).max(key, empty=-1)  # [P']
-    return torch.where(key >= 0, none - 1 - key % max(none, 1), of_level)
+    winners = Groups(pixel, len(of_level)).where(wins)
+    most = winners.max(own, empty=-1)  # [P']
+    best = winners.where(own == winners.spread(most, none=-1)).min(node, empty=none)  # ties: the first
+    return torch.where(best < none, best, of_level)
 
 
 def _keys_of_components(components: Components, first: int, num_pixels: int) -> Tensor:

@@ -57,7 +57,7 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
         the largest error. In a pair, parts are unmatched components, and the lowest velocity wins. A part belongs to
         its first node. The velocity of a node must win more slices near its targets than it loses.
 
-    Cost: 289 lookups for each part of t, 25 for each sweep and pair of near parts.
+    Cost: 578 lookups for each part of t (289 in a pair), 25 for each sweep and pair of near parts.
     """
     parts = _Parts.of(sweeps, components)
     if len(parts) == 0:

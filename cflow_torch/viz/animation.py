@@ -54,6 +54,8 @@ def flow_figures(
         view, position, _, drawn = split_sweep(frame.points, frame.is_ground, point_cloud_range)
         corners.append(view)
         longest.append(longest_flow(point_rows("residual flow", frame.result.residual_flow, len(position))[drawn]))
+    if not corners:
+        raise CFlowError("no pair: give at least one AnimatedPair")
     low = np.min(corners, axis=0)[0]
     high = np.max(corners, axis=0)[1]
     for frame in frames:

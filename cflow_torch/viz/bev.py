@@ -59,20 +59,16 @@ def plot_flow(
     """
     view, position, is_floor, rest = split_sweep(points, is_ground, point_cloud_range)
     given = result_or_residual
-    cluster = moves = None
-    if isinstance(given, FlowResult):
-        cluster = as_numpy(given.cluster_id)[rest]
-        moves = as_numpy(given.is_moving)[rest]
-        given = given.residual_flow
-    residual = point_rows("residual flow", given, len(position))
+    flow = given.residual_flow if isinstance(given, FlowResult) else given
+    residual = point_rows("residual flow", flow, len(position))[rest]
+    cluster = as_numpy(given.cluster_id)[rest] if isinstance(given, FlowResult) else None
+    moves = as_numpy(given.is_moving)[rest] if isinstance(given, FlowResult) else has_flow(residual)
     true_flow = None if truth is None else point_rows("truth", truth, len(position))[rest]
     if legend is not None and legend not in style.CORNERS:
         raise CFlowError(f"legend={legend!r}: give None or one of {', '.join(style.CORNERS)}")
 
     floor = position[is_floor]
     position = position[rest]
-    residual = residual[rest]
-    moves = has_flow(residual) if moves is None else moves
     if max_flow is None:
         max_flow = longest_flow(residual if true_flow is None else np.concatenate([residual, true_flow]))
 

@@ -11,7 +11,7 @@ from typing import Any, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.types import MIN_MOVING, SIZE, CFlowError, vectors
+from cflow_torch.types import CENTRE, MIN_MOVING, SIZE, CFlowError, vectors
 from cflow_torch.viz.clusters import PALETTE, cluster_colors
 from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MAX_ERROR, MIN_ERROR, has_flow
 from cflow_torch.viz.scene import ViewedPair, ViewerFrame
@@ -25,6 +25,7 @@ STATIC, GROUND, UNKNOWN, FIRST = 0, 1, 2, 3  # indices of greys that the page ch
 _HUES, _LEVELS = 36, 6  # hues, and levels of length; one more level is for flow longer than max_flow
 _PALEST = 0.35  # least saturation, so that slow motion is visible on a light page
 _FADED, _GREY = 0.15, 140  # we mix this share of a static object's colour with a grey that both themes show
+_TRACK_COLUMNS = ("id", "sweep", "cluster_id", "class", "num_points", *CENTRE, *SIZE, "heading", "vx", "vy")
 _STEPS = 64  # colours of a ramp
 _RAMP = np.array([(66, 125, 245), (38, 190, 205), (112, 205, 80), (250, 200, 40), (235, 60, 45)], float)
 
@@ -119,6 +120,9 @@ class PackedDrive:
 
     def add_tracks(self, tracks: Mapping[str, np.ndarray]) -> None:
         """Add the boxes of tracks. The points of a track get the same colour in all sweeps."""
+        missing = [name for name in _TRACK_COLUMNS if name not in tracks]
+        if missing:
+            raise CFlowError(f"tracks lack {', '.join(missing)}: give the table that `cflow_torch.track` returns")
         for frame, moving, (_, entries, cluster) in zip(self.frames, self.moving, self.points):
             is_now = tracks["sweep"] == frame["sweep"]
             rows = {name: values[is_now] for name, values in tracks.items()}
@@ -169,9 +173,9 @@ class PackedDrive:
             "steps": ARROW_STEPS,
             "chances": _STEPS if any(each["name"] == "moving" for each in chosen) else 0,
             "likely": MIN_MOVING,
-            "thinned": f"{shown:,} of {self.num_given:,} points are drawn: all that move, by estimate or truth, all "
-            f"with an error above {MIN_ERROR:g} m, and one other point per voxel of {side:g} m ({2 * side:g} m on the "
-            f"ground). Positions are rounded to {_UNIT * 100:g} cm.",
+            "thinned": f"{shown:,} of {self.num_given:,} points are drawn: within {_REACH:g} m, all that move, by "
+            f"estimate or truth, all with an error above {MIN_ERROR:g} m, and one other point per voxel of {side:g} m "
+            f"({2 * side:g} m on the ground). Positions are rounded to {_UNIT * 100:g} cm.",
         }
 
     def _thin(self, position: np.ndarray, important: np.ndarray, ground: np.ndarray) -> np.ndarray:

@@ -105,7 +105,7 @@ def save_page(
         CFlowError: as in `show`; the path does not end in .html; there is no result.
         OSError: the log cannot be read, or the file cannot be written. An error of `results` is passed on.
 
-    Cost: on disk about 0.3 MB per sweep of 100,000 points, and 1.2 MB for k3d; 1 MB of memory per sweep. Chromium
+    Cost: on disk about 0.2 MB per sweep of 100,000 points, and 1.1 MB for k3d; 1 MB of memory per sweep. Chromium
         opened a page of 698 MiB in 9 s.
     """
     checked_path(path, ".html")

@@ -20,8 +20,8 @@ MIN_ARROW_POINTS = 8  # a cluster with fewer moving points gets no arrow
 OBJECT_PIXEL = 0.5  # metres; without clusters, moving points in touching pixels are one object
 _MAX_PIXELS = 2048  # pixels on a side, at most; larger scenes get larger pixels
 FLOW_CAPTION = (
-    f"grey: static   colour: moves at least {MOVING:g} m per sweep   "
-    f"arrow: motion over {ARROW_STEPS} sweeps ({ARROW_STEPS / style.SWEEP_RATE:g} s at {style.SWEEP_RATE} Hz)"
+    f"grey: static   colour: moves (at least {MOVING:g} m per sweep, and probably)   "
+    f"arrow: motion over {ARROW_STEPS} sweeps"
 )
 EGO_OUTLINE = ((2.4, 0.0), (-1.9, 1.15), (-1.0, 0.0), (-1.9, -1.15))  # metres
 _RING, _MOST_RINGS = 10.0, 20  # metres between two rings; a view with more rings gets wider steps

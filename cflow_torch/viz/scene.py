@@ -8,7 +8,7 @@ from typing import Any, Mapping
 import numpy as np
 
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.types import CENTRE, CFlowError, FlowResult, Sweep, as_numpy, vectors
+from cflow_torch.types import CENTRE, CFlowError, FlowResult, Sweep, as_numpy, point_rows, vectors
 from cflow_torch.viz.panel import MIN_ARROW_POINTS, group_medians
 from cflow_torch.viz.style import SWEEP_RATE
 
@@ -46,7 +46,8 @@ class ViewedPair:
         truth = None
         times = (pc0.timestamp_ns, pc1.timestamp_ns)
         if labels is not None:
-            truth = np.where(as_numpy(labels.is_valid)[:, None], as_numpy(labels.flow) - pose_flow, np.nan)[kept]
+            true_flow = point_rows(f"pair {index}: the flow of the labels", labels.flow, rows)
+            truth = np.where(as_numpy(labels.is_valid)[:, None], true_flow - pose_flow, np.nan)[kept]
         return cls(
             index=index,
             timestamp_ns=times[0],

@@ -25,12 +25,14 @@ def flow_to_rgb(flow: Array, max_flow: float | None = None) -> np.ndarray:
         of the 55 steps, as in the viewers, so +y is (255, 230, 0), -x (0, 209, 255), -y (88, 0, 255).
 
     Raises:
-        CFlowError: `max_flow` is not positive.
+        CFlowError: `max_flow` is not positive, or the flow has no columns x and y.
 
     Source: Baker et al., A Database and Evaluation Methodology for Optical Flow (2011); flowpy. The field's viewers cut
         the steps of their wheel to integers, so their colours differ by up to 2 levels.
     """
     vectors = as_numpy(flow).astype(np.float64)
+    if vectors.ndim == 0 or vectors.shape[-1] < 2:
+        raise CFlowError(f"flow has shape {vectors.shape}: give (..., 2) or more columns, x and y first")
     if max_flow is not None and not max_flow > 0:
         raise CFlowError(f"max_flow={max_flow}: give a positive length in metres, or None for the longest flow")
 

@@ -44,7 +44,7 @@ class Batch:
     # (A, P) float64, metres, frame of t+1 of the point's window. A = 2 (x and y) if the method needs no z, else 3.
     positions: Tensor
     is_active: Tensor  # (P,) bool, False = a row of pc0 that is not active; its position is undefined
-    has_result: Tensor  # (P,) bool, False = a row of pc0 that is not active or lies outside the region
+    has_result: Tensor  # (P,) bool, False = a row of pc0 that is not active or outside the region; True in other sweeps
     image: Tensor  # (P,) int32, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1 or t+2, ...
     num_newest: int  # number of points of t+1, which come first and are never warped
     num_windows: int  # B

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from cflow_torch.ops.indices import divide
-from cflow_torch.tensors import read_positions
+from cflow_torch.tensors import float64_tensor, read_positions
 from cflow_torch.transforms import relative_transform, rigid_transform
 from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy, check_array, point_rows
 from cflow_torch.windows.ego_motion import compensate
@@ -37,7 +36,7 @@ def scan_fractions(points: Array, direction: str, origin: Any = (0.0, 0.0, 0.0))
         origin: (3,) float, metres, position of the LiDAR in the frame of the points.
 
     Convention: 0 = the instant of the sweep, negative = earlier. The instant is when the LiDAR looks ahead, unless the
-        name says that it is the start or the end of the turn. The result is in (-0.5, 0.5] for a turn that begins
+        name says that it is the start or the end of the turn. The result is in [-0.5, 0.5] for a turn that begins
         behind, as KITTI's, [-0.25, 0.75) for "clockwise_left", and [0, 1) for one that begins ahead. It is in [0, 1)
         for every "_at_start", and in [-1, 0) for every "_at_end". If you name a wrong start, some points are one turn
         off in every sweep: static objects still stay in place, unless they pass the start.
@@ -124,7 +123,8 @@ def deskew_objects(window: Window, result: FlowResult, sweep_interval: float = 0
     this.
 
     Args:
-        window: the sweeps of the flow; `pc0.point_times` and the poses and time stamps of pc0 and pc1 are used.
+        window: the sweeps of the flow; `pc0.point_times` and the poses of pc0 and pc1 are used, and the time
+            stamps if all sweeps have one.
         result: flow of the points of pc0, by a preset that uses point times (`default`, `offline`, `live`).
         sweep_interval: seconds from t to t+1 if a sweep of the window has no time stamp, as in the settings.
 
@@ -153,5 +153,5 @@ def deskew_objects(window: Window, result: FlowResult, sweep_interval: float = 0
         rotation = relative_transform(before.pose, window.pc1.pose)
         rotation[:3, 3] = 0
         flow = compensate(flow, rotation)
-    times = torch.as_tensor(before.point_times).to(flow.device, torch.float64)
+    times = float64_tensor(before.point_times, flow.device)
     return (read_positions([before], flow.device) - flow * divide(times, interval)).t()

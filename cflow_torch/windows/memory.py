@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -20,9 +21,10 @@ _M_MMAP_THRESHOLD = -3
 _CGROUP = Path("/sys/fs/cgroup")
 # Working memory of one pixel of one sweep (occupancy and cluster) before the clusters are known.
 _BYTES_PER_PIXEL = 10
-# Memory of a group on a CPU if `max_memory` is None: about 9 pairs, or 4 windows of six sweeps. Larger groups save
+# Memory of a group on a CPU if `max_memory` is None: some pairs, or one window of six sweeps. Larger groups save
 # operations, but fresh pages of memory cost more.
 _BYTES_ON_CPU = 1 << 29
+_SHARE_OF_GPU = 0.5  # of its free memory, for a group on a GPU if `max_memory` is None
 
 
 def require_memory(num_bytes: int, device: torch.device, what: str, remedy: str) -> None:
@@ -32,16 +34,20 @@ def require_memory(num_bytes: int, device: torch.device, what: str, remedy: str)
     """
     if num_bytes <= _MUCH:
         return
-    if device.type == "cuda":
-        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-        free: int | None = torch.cuda.mem_get_info(device)[0] + cached
-    else:
-        free = available_memory({})
+    free = _free_memory(device)
     if free is not None and num_bytes > free:
         raise CFlowError(
             f"{what} needs about {num_bytes / 1e9:.1f} GB of memory ({num_bytes} bytes), {device} has "
             f"{free / 1e9:.1f} GB left: {remedy}"
         )
+
+
+def _free_memory(device: torch.device) -> int | None:
+    """Return the bytes that are free on a device; None if the system does not report it."""
+    if device.type != "cuda":
+        return available_memory({})
+    cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return int(torch.cuda.mem_get_info(device)[0]) + cached
 
 
 def available_memory(environ: Mapping[str, str]) -> int | None:
@@ -97,12 +103,12 @@ def split_windows(
 ) -> list[list[Window]]:
     """Split checked windows, in order, into groups that fit into memory. Results do not depend on the grouping.
 
-    The grid is that of the finest scale, whose images are the largest. `max_memory` is in bytes per group; None = no
-    limit on a GPU, 512 MiB on a CPU, where large groups are slower. A window that needs more is a group of its own. One
-    that exceeds free memory is a `CFlowError`."""
+    The grid is that of the finest scale, whose images are the largest. `max_memory` is in bytes per group; None = half
+    of the free memory of a GPU, 512 MiB on a CPU, where large groups are slower. A window that needs more is a group of
+    its own. One that exceeds free memory is a `CFlowError`."""
     groups: list[list[Window]] = []
-    if max_memory is None and device.type == "cpu":
-        max_memory = _BYTES_ON_CPU
+    if max_memory is None:
+        max_memory = _BYTES_ON_CPU if device.type == "cpu" else _SHARE_OF_GPU * (_free_memory(device) or math.inf)
     used = 0
     for window in windows:
         sweeps = window.sweeps
@@ -115,7 +121,7 @@ def split_windows(
             f"{grid.pixel_size} m,",
             "give a smaller point_cloud_range, larger pixel_sizes or fewer points",
         )
-        if not groups or (max_memory is not None and used + needed > max_memory):
+        if not groups or used + needed > max_memory:
             groups.append([])
             used = 0
         groups[-1].append(window)

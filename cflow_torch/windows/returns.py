@@ -11,7 +11,7 @@ import torch
 from cflow_torch.types import Array, Sweep, as_numpy
 
 _SAMPLE, _FEWEST = 1024, 10  # rows in which we look for a repeated position, and its repetitions, 1 % of them
-_STEP = 7919  # between rows of the sample: a prime, so that no pattern of rows repeats with it
+_GOLDEN = (5**0.5 - 1) / 2  # rows at multiples of this share of all rows are spread evenly, whatever their number
 _TOO_MANY = 10_000_000  # points of a sweep
 MISSING = "points of a sweep are no returns (exactly at 0, or many at one position)"
 
@@ -61,4 +61,6 @@ def without_missing(sweep: Sweep) -> tuple[Sweep, int]:
 
 def _sample_of(count: int) -> np.ndarray:
     """Return up to 1024 rows of so many, (K,) int64."""
-    return np.arange(min(_SAMPLE, count)) * _STEP % max(count, 1)
+    if count <= _SAMPLE:
+        return np.arange(count)
+    return (np.arange(_SAMPLE) * _GOLDEN % 1 * count).astype(np.int64)

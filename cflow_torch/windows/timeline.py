@@ -109,7 +109,11 @@ def _entries(
 
 
 def source_sweeps(window: Window, config: Config) -> list[SourceSweep]:
-    """List pc0, the history, then the sweeps after t+1. We skip repeats of a listed sweep and, after t+1, of pc1."""
+    """List pc0, the history, then the sweeps after t+1.
+
+    We skip repeats of a listed sweep and, after t+1, of pc1. Older and later sweeps without points are skipped, too,
+    because they do not tell that a place is empty.
+    """
     if len(window.pcf) > config.num_future:
         raise CFlowError(
             f"the window has {len(window.pcf)} future sweeps but num_future={config.num_future}: raise num_future, or "
@@ -126,7 +130,8 @@ def source_sweeps(window: Window, config: Config) -> list[SourceSweep]:
     for step, (name, sweep) in enumerate(named_sweeps(window)[1:], 1):
         is_future = step > num_past
         earlier = [source.sweep for source in sources] + ([window.pc1] if is_future else [])
-        if not any(_is_same(sweep, other) for other in earlier):
+        is_empty = step > 1 and sweep.points.shape[0] == 0
+        if not is_empty and not any(_is_same(sweep, other) for other in earlier):
             sources.append(SourceSweep(name, sweep, num_past - step if is_future else step))
     return sources
 

@@ -104,6 +104,7 @@ BAD = [
     ({"is_ground": np.zeros(3, bool)}, "one per point", True),
     ({"pose": None}, "have no pose", False),
     ({"timestamp_ns": None}, "have no time", False),
+    ({"pose": np.full((4, 4), np.nan), "timestamp_ns": 10**12}, "pose1 holds NaN", False),  # and after a gap
 ]
 
 
@@ -135,11 +136,13 @@ def test_settings_that_a_stream_cannot_have_are_refused(sweeps):
 
 def test_missing_ground_and_poses_are_estimated():
     drive = make_small_drive(4, seed=2)
-    stream = FlowStream("default", num_history=0)
+    stream = FlowStream("default", num_history=0, pixel_sizes=(0.4, 0.2))
     if find_spec("small_gicp") is None:
         with pytest.raises(CFlowError, match="pip install small-gicp"):
             stream.push(drive.sweep(0).points)
         return
+    with pytest.raises(CFlowError, match="fewer than 100"):
+        stream.push(drive.sweep(0).points[:10])
     for index in range(4):
         result = stream.push(drive.sweep(index).points, time=drive.timestamps[index])
     found, truth = stream.window.pc1.is_ground, drive.sweep(3).is_ground
@@ -147,6 +150,12 @@ def test_missing_ground_and_poses_are_estimated():
     moved = np.linalg.inv(stream.window.pc0.pose) @ stream.window.pc1.pose
     true = np.linalg.inv(drive.sweep(2).pose) @ drive.sweep(3).pose
     assert np.abs(moved - true).max() < 0.2 and result.residual_flow.any()
+    given = FlowStream("default", num_history=0)
+    with pytest.raises(CFlowError, match="fewer than 100"):
+        given.push(drive.sweep(0).points[:10])
+    for index in range(2):  # the stream is still one without estimated poses
+        result = given.push(drive.sweep(index))
+    assert result is not None
 
 
 def test_ground_is_found_by_default_but_a_given_mask_wins():

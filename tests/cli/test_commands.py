@@ -197,7 +197,7 @@ def test_warnings_are_one_line_without_a_source_path(tmp_path, cflow, capsys):
     folder = write_small_log("arrays", tmp_path / "data")
     shutil.rmtree(next(folder.rglob("ground")))
     for command in (("plot",), ("flow", "engine.workers=1")):
-        assert cflow(*command, folder, f"output={tmp_path / command[0]}", "model=paper") == 0
+        assert cflow(*command, folder, f"output={tmp_path / command[0]}", "model=paper", SMALL) == 0
         lines = [line for line in capsys.readouterr().err.splitlines() if "warning" in line.lower()]
         assert len(lines) == 1 and lines[0].startswith("warning: ") and ".py" not in lines[0]
         assert "no ground masks, so we find the ground" in lines[0] and "data.find_ground=null" in lines[0]

@@ -17,11 +17,14 @@ from cflow_torch.data.catalog import DATA_SETS, recognise
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.types import CFlowError
 
+NEAR = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
+
 
 @pytest.mark.parametrize("name", SMALL_LOGS)
 def test_a_path_is_enough(name, tmp_path, cflow, capsys):
     root = write_small_log(name, tmp_path / "data")
-    call = ("flow", root, f"output={tmp_path / 'out'}", "model=paper", "engine.workers=1", "data.check=false")
+    model = ("model=paper", "model.pixel_sizes=[0.4]", NEAR)
+    call = ("flow", root, f"output={tmp_path / 'out'}", *model, "engine.workers=1", "data.check=false")
     assert cflow(*call) == 0
     assert f"{root}: data={name}\n" in capsys.readouterr().out
     files = list((tmp_path / "out").glob("*/*.feather"))
@@ -32,7 +35,7 @@ def test_a_path_is_enough(name, tmp_path, cflow, capsys):
 
 
 def test_a_call_without_a_path_says_that_it_simulates(cflow, capsys):
-    assert cflow("flow", "dry_run=true") == 0
+    assert cflow("flow", "dry_run=true", "data.num_sweeps=2") == 0
     assert "so we simulate a drive: data=synthetic\n" in capsys.readouterr().out
 
 
@@ -108,7 +111,7 @@ def mine(tmp_path: Path) -> Path:
 
 def test_your_own_reader_by_configuration_only(mine, cflow, capsys):
     pytest.importorskip("matplotlib")
-    own = ("--config-dir", mine / "my", "data=mine", "data.speed=5", "model=paper")
+    own = ("--config-dir", mine / "my", "data=mine", "data.speed=5", "model=paper", NEAR)
     assert cflow("check", *own) in (0, 1)
     assert re.search("^mine .*^back ", capsys.readouterr().out, re.MULTILINE | re.DOTALL)
     # A limit of its memory gives the worker a process of its own, which must find the reader, too.

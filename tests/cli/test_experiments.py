@@ -58,7 +58,8 @@ def test_the_jobs_of_an_experiment_are_the_rows_of_its_table(experiment, compose
 
 
 def test_a_sweep_keeps_every_result_and_resumes(log_folder, tmp_path, cflow, capsys):
-    data = ("data=av2", log_folder, "data.check=false", "data.step=2", "model.point_cloud_range=[-20,-20,-9,20,20,9]")
+    small = ("model.point_cloud_range=[-20,-20,-9,20,20,9]", "model.pixel_sizes=[0.4]")
+    data = ("data=av2", log_folder, "data.check=false", "data.step=2", *small)
     call = ("eval", "-m", "experiment=history", *data, f"output={tmp_path}", "model.num_history=0,2")
     assert cflow(*call) == 0
     files = sorted(tmp_path.rglob("results.json"))

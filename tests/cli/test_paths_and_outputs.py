@@ -16,7 +16,8 @@ from cflow_torch.data.json_file import read_json
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.fleet.progress import show_warnings_as_lines
 
-SMALL = ("model=paper", "model.point_cloud_range=[-20,-20,-inf,20,20,inf]", "data.check=false")
+MODEL = ("model=paper", "model.point_cloud_range=[-20,-20,-inf,20,20,inf]", "model.pixel_sizes=[0.4]")
+SMALL = (*MODEL, "data.check=false")
 
 
 @pytest.fixture

@@ -73,7 +73,8 @@ def write_raw(folder: Path, count: int = 3, first: int = 0) -> Path:
     (day / "calib_imu_to_velo.txt").write_text(f"calib_time: 25-May-2012 16:47:16\n{rigid}")
     rigid = f"R: {text(T_CAMERA_LIDAR[:3, :3])}\nT: {text(T_CAMERA_LIDAR[:3, 3])}\n"
     (day / "calib_velo_to_cam.txt").write_text(f"calib_time: 15-Mar-2012 11:37:16\n{rigid}delta_f: 0 0\n")
-    camera = f"corner_dist: 9.95e-02\nR_rect_00: {text(np.eye(3))}\nP_rect_02: {text(PROJECTION)}\n"
+    camera = f"corner_dist: 9.95e-02\nR_rect_00: {text(np.eye(3))}\n"
+    camera += f"S_rect_02: 1.226e+03 3.7e+02\nP_rect_02: {text(PROJECTION)}\n"
     (day / "calib_cam_to_cam.txt").write_text(camera)
     return folder
 
@@ -406,7 +407,7 @@ def test_the_colour_cameras_project_by_the_calibration(tmp_path: Path, layout: s
         log = KITTILog(folder)
     (camera,) = log.cameras(1)  # there is no calibration of camera 3
     assert (camera.name, camera.image, camera.seconds) == ("image_02", log.files[1].stem, 0.0)
-    assert camera.size == ((1226, 370) if layout == "sequence" else (1242, 375))
+    assert camera.size == ((1242, 375) if layout == "tracking" else (1226, 370))
     points = cloud(1)[:3, :3]
     homogeneous = PROJECTION @ T_CAMERA_LIDAR @ np.column_stack([points, np.ones(3)]).T
     np.testing.assert_allclose(camera.project(camera.see(points)), (homogeneous[:2] / homogeneous[2]).T, atol=1e-6)

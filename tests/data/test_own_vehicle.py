@@ -90,7 +90,7 @@ def test_a_wall_along_the_road_a_standing_vehicle_and_unknown_poses_stay(hood):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             assert sum(num_left_out(OwnVehicleLog(log))) == 0
-        assert next(one for one in examine(OwnVehicleLog(log)) if one.topic == "own vehicle").status == RIGHT
+        assert next(one for one in OwnVehicleLog(log).findings() if one.topic == "own vehicle").status == RIGHT
 
 
 def test_points_upside_down_are_not_taken_for_the_vehicle():

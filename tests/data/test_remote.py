@@ -224,7 +224,7 @@ def test_folders_are_local(remote):
         pass
 
 
-def test_a_folder_appears_complete_when_its_block_ends(tmp_path):
+def test_a_folder_appears_complete_when_its_block_ends(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt), new_folder(tmp_path, "log") as folder:
         raise KeyboardInterrupt
     assert names(tmp_path) == ()
@@ -238,6 +238,18 @@ def test_a_folder_appears_complete_when_its_block_ends(tmp_path):
     with pytest.raises(KeyboardInterrupt), new_folder(tmp_path, "log", replace=True):
         raise KeyboardInterrupt
     assert (tmp_path / "log" / "deep" / "a").read_bytes() == b"new"
+    replace_file = os.replace
+
+    def interrupted(source, target):
+        if Path(target).name == "log":  # the new folder, and then the older one
+            monkeypatch.setattr(os, "replace", replace_file)
+            raise KeyboardInterrupt
+        replace_file(source, target)
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt), new_folder(tmp_path, "log", replace=True):
+        pass
+    assert (tmp_path / "log" / "deep" / "a").read_bytes() == b"new" and names(tmp_path) == ("log",)
     with new_folder(tmp_path, "log", replace=True):
         pass
     assert names(tmp_path) == ("log",) and names(tmp_path / "log") == ()

@@ -34,7 +34,10 @@ def write_drive(root, frame: str, origin: float):
     return drive, poses
 
 
-@pytest.mark.parametrize(("frame", "origin"), [("sensor", 0), ("world", 0), ("sensor", 300), ("world", 300)])
+@pytest.mark.parametrize(
+    ("frame", "origin"),
+    [("sensor", 0), ("sensor", 300), ("world", 300), pytest.param("world", 0, marks=pytest.mark.slow)],
+)
 def test_poses_are_read_and_the_frame_is_found(tmp_path, frame: str, origin: float) -> None:
     drive, poses = write_drive(tmp_path, frame, origin)
     with pytest.warns(CFlowWarning, match="poses come from VIEWPOINT"):
@@ -47,7 +50,7 @@ def test_poses_are_read_and_the_frame_is_found(tmp_path, frame: str, origin: flo
     assert ArraysLog(tmp_path, poses=None).poses is None
 
 
-@pytest.mark.parametrize("frame", ["sensor", "world"])
+@pytest.mark.parametrize("frame", [pytest.param("sensor", marks=pytest.mark.slow), "world"])
 def test_cleaned_clouds_have_the_same_form(tmp_path, frame: str) -> None:
     """`cflow clean` writes VIEWPOINT and points in the frame of the input, and its output is read like the input."""
     pytest.importorskip("hydra")

@@ -46,6 +46,13 @@ def test_is_stored_with_outputs(name: str) -> None:
     assert (FOLDER / f"{name}.ipynb").stat().st_size < limit
 
 
+def test_the_extra_notebooks_contains_the_extras_that_they_name() -> None:
+    project = (FOLDER.parent / "pyproject.toml").read_text(encoding="utf-8")
+    listed = re.search(r'^notebooks = \["cflow_torch\[([\w,]+)\]"', project, re.MULTILINE)[1].split(",")
+    named = {extra for name in NAMES for cell in cells(name) for extra in re.findall(r"extra `(\w+)`", cell["source"])}
+    assert named and named <= set(listed)
+
+
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in NAMES]
 )

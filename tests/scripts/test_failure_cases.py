@@ -46,7 +46,8 @@ def test_an_appearing_car_is_wrong_at_first(failures: Any) -> None:
     assert confidence[0] < 0.78 < confidence[1]
 
 
-def test_later_sweeps_fix_an_appearing_car(failures: Any) -> None:
-    for seed in range(3):  # with the second seed, the car is part of the coarse component of a parked van
-        online, offline = (attempt.error for attempt in failures.make_case("appearing", seed).attempts)
-        assert online > 0.4 and offline < 0.09 and offline < online / 6
+# With seed 1, the car is part of the coarse component of a parked van.
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 2))])
+def test_later_sweeps_fix_an_appearing_car(failures: Any, seed: int) -> None:
+    online, offline = (attempt.error for attempt in failures.make_case("appearing", seed).attempts)
+    assert online > 0.4 and offline < 0.09 and offline < online / 6

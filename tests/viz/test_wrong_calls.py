@@ -13,12 +13,23 @@ from matplotlib.figure import Figure
 from toy_street import Street, result_of
 
 from cflow_torch import CFlowError, FlowResult
-from cflow_torch.data.log import window
-from cflow_torch.viz import page, plot_flow, record_log, save_animation, save_page, save_picture, show
+from cflow_torch.data.log import FlowLabels, window
+from cflow_torch.viz import (
+    flow_figures,
+    flow_to_rgb,
+    page,
+    plot_flow,
+    record_log,
+    save_animation,
+    save_page,
+    save_picture,
+    show,
+)
 
 ONE, OTHER = Figure(figsize=(2, 1), dpi=50), Figure(figsize=(2.2, 1), dpi=50)
 SHORT = FlowResult(*[values[:7] for values in result_of()._given().values()])
 WINDOW = window(Street(), 0)
+OTHER_LABELS = FlowLabels(np.zeros((7, 3), np.float32), np.zeros(7, np.uint8), np.ones(7, bool))
 
 
 def failing(value: Any) -> Any:
@@ -36,6 +47,8 @@ CALLS: dict[str, list[tuple[Callable[[Path], Any], str]]] = {
         (lambda folder: save_page(Street(), [], folder / "a.html"), "there is no pair to show"),
         (lambda folder: save_page(Street(), [], folder / "a.html", voxel=0), "voxel=0"),
         (lambda folder: show([WINDOW] * 2, [result_of()]), "2 windows, 1 results, 2 labels"),
+        (lambda folder: show(WINDOW, result_of(), labels=OTHER_LABELS), "labels has shape .7, 3.: give .51"),
+        (lambda folder: show(WINDOW, result_of(), tracks={}), "tracks lack id, sweep, .* `cflow_torch.track`"),
     ],
     "rerun": [
         (lambda folder: record_log(Street(), [], folder / "a.bag"), "does not end in .rrd"),
@@ -60,6 +73,10 @@ CALLS: dict[str, list[tuple[Callable[[Path], Any], str]]] = {
         (lambda folder: save_picture(ONE, folder / "a.pdf"), r"does not end in \.png"),
         (lambda folder: plot(points=np.zeros((5, 2))), "points has shape"),
         (lambda folder: plot(result_or_residual=np.zeros((4, 3))), "residual flow has shape"),
+        (lambda folder: plot(result_or_residual=result_of()), "residual flow has shape .51, 3.: give .5, 3."),
+        (lambda folder: plot(points=WINDOW.pc0), "points is Sweep: give an array .N, 3., such as sweep.points"),
+        (lambda folder: next(flow_figures([])), "no pair: give at least one AnimatedPair"),
+        (lambda folder: flow_to_rgb(np.zeros((5, 1))), "flow has shape .5, 1.: give .* x and y first"),
         (lambda folder: plot(max_flow=-1.0), "max_flow"),
         (lambda folder: plot(legend="middle"), "upper right"),
         (lambda folder: plot(point_cloud_range=(0, 0, 1, 1)), "point_cloud_range"),

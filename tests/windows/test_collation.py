@@ -121,13 +121,29 @@ def test_the_ego_box_is_in_the_frame_of_each_sweep_and_includes_its_ends():
 def test_windows_are_grouped_by_memory(monkeypatch):
     grid, windows = Grid(1.0, RANGE[:3], RANGE[3:]), [scene(seed) for seed in range(5)]
 
-    def sizes(max_memory=None) -> list:
-        return [len(group) for group in split_windows(windows, grid, CPU, 160, max_memory)]
+    def sizes(max_memory=None, device=CPU) -> list:
+        return [len(group) for group in split_windows(windows, grid, device, 160, max_memory)]
 
     assert sizes() == [5] and sizes(1) == [1] * 5
     assert sum(sizes(1_000_000)) == 5 and 1 < len(sizes(1_000_000)) < 5
     monkeypatch.setattr(memory, "_BYTES_ON_CPU", 1)
     assert sizes() == [1] * 5 and split_windows([], grid, CPU, 160, None) == []
+    monkeypatch.setattr(memory, "_free_memory", lambda device: 2_000_000)
+    assert sizes(device=torch.device("cuda")) == sizes(1_000_000)
+
+
+def test_results_of_a_batch_hold_their_own_rows_alone():
+    results = make_model(config("verified", num_history=0), "cpu")([scene(seed) for seed in range(3)])
+    for result in results:
+        assert result.flow.untyped_storage().nbytes() == 12 * len(result.flow)
+        assert result.cluster_id.untyped_storage().nbytes() == 8 * len(result.flow)
+
+
+def test_arrays_are_on_the_device_of_the_model_whatever_the_default_device_is():
+    model, window = make_model(config("verified", num_history=0), "cpu"), scene(0)
+    (expected,) = model([window])
+    with torch.device("meta"):
+        assert_same_bits(model([window])[0], expected)
 
 
 def test_sweeps_that_are_ignored_need_no_memory(monkeypatch):

@@ -13,18 +13,20 @@ from cflow_torch.data.arrays import ArraysLog
 from cflow_torch.diagnosis.inspection import Inspection
 from cflow_torch.simulator import make_drive
 from cflow_torch.types import CFlowWarning
-from cflow_torch.windows.returns import missing_returns
+from cflow_torch.windows.returns import missing_returns, without_missing
 
 
 @pytest.mark.parametrize("fill", [(0, 0, 0), (np.nan,) * 3, (1.2, 0, 1.8), (-1e3,) * 3, (np.inf, 1, 1)])
 @pytest.mark.parametrize("share", [0.02, 0.6])
-def test_defaults_are_found_in_any_pattern(fill: tuple, share: float) -> None:
+@pytest.mark.parametrize("count", [20_000, 7918, 15_838])
+def test_defaults_are_found_in_any_pattern(fill: tuple, share: float, count: int) -> None:
     rng = np.random.default_rng(0)
-    points = rng.normal(0, 20, (20_000, 3)).astype(np.float32)
-    for is_filled in (rng.random(20_000) < share, np.arange(20_000) > 20_000 * (1 - share)):
+    points = rng.normal(0, 20, (count, 3)).astype(np.float32)
+    for is_filled in (rng.random(count) < share, np.arange(count) > count * (1 - share)):
         points[is_filled] = fill
         assert np.array_equal(missing_returns(points), is_filled)
-        points = rng.normal(0, 20, (20_000, 3)).astype(np.float32)
+        assert without_missing(Sweep(points))[1] == (is_filled.sum() if np.isfinite(points).all() else 0)
+        points = rng.normal(0, 20, (count, 3)).astype(np.float32)
     assert not missing_returns(points).any() and len(missing_returns(points[:0])) == 0
     assert not missing_returns(np.repeat(points, 3, axis=0)).any(), "every return three times"
     assert not missing_returns(np.round(points / 4) * 4 + 0.5).any(), "a coarse grid"

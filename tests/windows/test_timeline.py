@@ -47,6 +47,16 @@ def test_sweeps_after_t_plus_1_are_chosen_likewise():
     assert intervals(config, 4, 3) == [[1, 2, 5], [1, -1, -3]]
 
 
+def test_older_and_later_sweeps_without_points_are_left_out():
+    window = scene(12, num_history=1, num_points=90)
+    empty = replace(window.pch[0], points=window.pch[0].points[:0], is_ground=None)
+    model = make_model(small("offline", num_history=4, num_future=3), "cpu")
+    (expected,) = model([window])
+    (result,) = model([replace(window, pch=(*window.pch, empty), pcf=(empty,))])
+    assert_same_bits(result, expected)
+    assert expected.residual_flow.any()
+
+
 def test_the_result_is_that_of_a_window_with_the_compared_sweeps_alone():
     window = scene(12, num_history=4, num_points=90)
     stamps = iter(range(10**9, 0, -(10**8)))

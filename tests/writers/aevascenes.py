@@ -55,6 +55,7 @@ def write_aevascenes_sequence(log: Drive, root: str | Path, layout: str = "v2") 
         - We write only motion-compensated clouds, because a recording has no others.
         - Every point has a class name: "road" on the ground, the class of the box that holds it, or "other_structure".
           `semantic_labels_idx` is the position of the name in `CATEGORY_NAME`. Aeva's own numbers may differ.
+        - Points have a radial velocity of 0, because a recording has none.
         - Boxes have no velocities, because the reader does not use them.
 
     Raises:
@@ -120,7 +121,7 @@ def _write_cloud(path: Path, unit: UnitReturns, classes: np.ndarray, where: str)
     np.savez(
         path,
         xyz=np.asarray(unit.points, np.float32),
-        velocity=np.asarray(unit.radial_velocity, np.float32)[:, None],
+        velocity=np.zeros((len(offset), 1), np.float32),
         reflectivity=np.asarray(unit.intensity, np.float32)[:, None],
         line_index=np.asarray(unit.ring, np.uint32)[:, None],
         time_offset_ns=offset.astype(np.uint32)[:, None],

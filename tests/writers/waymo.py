@@ -139,7 +139,7 @@ def _write_components(log: Drive, folder: Path) -> None:
             numbers = _laser_numbers([unit.name for unit in units])
             images = []
             for unit, number in sorted(zip(units, numbers), key=lambda pair: pair[1]):
-                calibration = _calibration(unit, log.elevations(unit.name))
+                calibration = _calibration(unit)
                 image, pixel_poses = _image_cells(log, index, unit, calibration, number == TOP)
                 images.append({**key, LASER: number, **image})
                 if pixel_poses is not None:
@@ -179,10 +179,10 @@ def _laser_numbers(names: Sequence[str]) -> list[int]:
     return [LASERS[name] for name in names]
 
 
-def _calibration(unit: UnitReturns, elevations: np.ndarray) -> LaserCalibration:
+def _calibration(unit: UnitReturns) -> LaserCalibration:
     """Calibration of a unit. As for Waymo's small lasers, evenly spaced beams are given by their outer edges only."""
     T_ego_sensor = np.asarray(unit.T_ego_sensor, np.float64)
-    elevations = np.asarray(elevations, np.float64)
+    elevations = np.asarray(unit.elevations, np.float64)
     steps = np.diff(elevations)
     if len(steps) and np.ptp(steps) < 1e-12 and unit.name != "TOP":
         half = (elevations[-1] - elevations[0]) / len(steps) / 2

@@ -92,7 +92,7 @@ def encode_images(
 
     If `shot_poses` are too inaccurate for a pixel, we encode the unit again with `true_poses`.
     """
-    height = unit.num_rings
+    height = len(unit.elevations)
     width = unit.num_columns
     points = np.asarray(unit.points, np.float64)  # laser frame, at the pose of the frame
     seen = points if shot_poses is None else shot_poses.to_shot(points, calibration.T_ego_sensor)

@@ -167,7 +167,7 @@ def copy_rows(source: PathLike, target: PathLike, is_kept: np.ndarray, layout: B
     """Write some points of a cloud to another file of the same suffix, with names, types and order of its columns.
 
     Args:
-        source, target: files of one of `SUFFIXES`.
+        source, target: files of one of `SUFFIXES`; the source may also end in `.gz`.
         is_kept: (N,) bool, for every point of `source`.
         layout: of `.bin` files; None = see `find_bin_layout`.
 
@@ -179,7 +179,9 @@ def copy_rows(source: PathLike, target: PathLike, is_kept: np.ndarray, layout: B
         CFlowError: the source cannot be read, or has another number of points.
     """
     source = as_path(source)
-    suffix = _suffix(source)
+    suffix = _suffix(as_path(target))
+    if suffix_of(source) != suffix:
+        raise CFlowError(f"{target} is not of the format of {source}: give a name that ends in {suffix_of(source)}")
     with file_errors(source, _hint(source)):
         content = read_bytes(source)
         number = len(_positions(_read(source, layout))[0])

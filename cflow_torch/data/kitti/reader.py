@@ -292,13 +292,17 @@ class KITTILog(ArraysLog):
         return None if camera is None else camera[0]
 
     def _image_size(self, camera: str) -> tuple[int, int]:
-        """Return width and height of the images of a camera, of the drive if it has images."""
+        """Return width and height of the rectified images of a camera: of the drive's images, or of the calibration."""
         root = self.drive.root
         folders = {"raw": f"image_{camera}/data", "sequence": f"image_{int(camera)}"}
         folder = root / folders.get(self.drive.layout, f"image_{camera}/{self.drive.clouds.name}")
         with remote_errors(folder):
             image = next(iter(sorted(folder.glob("*.png"))), None) if folder.is_dir() else None
-        return IMAGE_SIZE if image is None else png_size(image)
+        if image is not None:
+            return png_size(image)
+        of_cameras = self._calibration("cam_to_cam") or {}
+        width, height = of_cameras.get(f"cam_to_cam.S_rect_{camera}", IMAGE_SIZE)
+        return int(width), int(height)
 
     def _camera(self, name: str = _ANNOTATED_CAMERA) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the (4, 4) `T_camera0_lidar` with rectification, and the (3, 4) projection of a camera."""
