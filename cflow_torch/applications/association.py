@@ -46,7 +46,8 @@ def of_own_vehicle(groups: MovingGroups, sweeps: Window) -> Tensor:
     """Tell which points of sweep t belong to moving groups that are returns of its own vehicle, (M,) bool.
 
     They move as the vehicle does, and are around its origin, or near the vehicle if it drives faster than people walk.
-    Another vehicle beside it may seem to be around the origin, too. Without poses, we cannot tell.
+    The place alone does not tell: a car below a bridge is around the origin of a sensor on it. Nor do sweeps without
+    poses.
     """
     if sweeps.pc0.pose is None or sweeps.pc1.pose is None:
         return torch.zeros_like(groups.moves)

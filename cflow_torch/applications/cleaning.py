@@ -95,7 +95,7 @@ class CleanLog(MaskedLog):
             moving; with `remove_stopped` also is_valid and, if it has it, confidence.
         remove_stopped: also remove objects before they start and after they stop, such as cars at a light. Tracking
             finds them, also in a sweep without flow. It takes a pass over the log before the first sweep is returned,
-            and the memory of 1 bit per point, of the points of tracks, and of 0.1 to 0.2 MB a sweep for what is around.
+            and the memory of 1 bit per point, of the points of tracks, and of 0.1 to 0.2 MB a sweep for static places.
         sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
 
     Attributes:

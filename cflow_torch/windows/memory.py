@@ -107,8 +107,11 @@ def split_windows(
     of the free memory of a GPU, 512 MiB on a CPU, where large groups are slower. A window that needs more is a group of
     its own. One that exceeds free memory is a `CFlowError`."""
     groups: list[list[Window]] = []
-    if max_memory is None:
-        max_memory = _BYTES_ON_CPU if device.type == "cpu" else _SHARE_OF_GPU * (_free_memory(device) or math.inf)
+    if max_memory is None and device.type == "cpu":
+        max_memory = _BYTES_ON_CPU
+    elif max_memory is None:
+        free = _free_memory(device)
+        max_memory = math.inf if free is None else _SHARE_OF_GPU * free
     used = 0
     for window in windows:
         sweeps = window.sweeps
