@@ -105,7 +105,7 @@ def print_row(of_set: str, setting: str, figures: Figures) -> None:
     print(f"| {of_set} | {setting} | {shown} | {moving:.0f} |", flush=True)
 
 
-def of_set(preset: str, history: int, half_side: float | None) -> dict[str, Any]:
+def settings_of_set(preset: str, history: int, half_side: float | None) -> dict[str, Any]:
     """Return the settings that all presets have on a set: its history, if the preset takes one, and its region."""
     settings: dict[str, Any] = {}
     if "num_history" in make_config(preset).as_dict():
@@ -122,7 +122,7 @@ def score_preset(scored: ScoredSet, preset: str, changes: dict[str, Any], steps:
 
     Small drives are scored one by one and averaged, as in docs/limits.md.
     """
-    config = make_config(preset, **{**of_set(preset, scored.history, scored.half_side), **changes})
+    config = make_config(preset, **{**settings_of_set(preset, scored.history, scored.half_side), **changes})
     model, frames = make_model(config), []
     for step, replacement in steps.items():
         setattr(model, step, replacement)

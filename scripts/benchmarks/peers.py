@@ -40,7 +40,7 @@ from cflow_torch.data.json_file import read_json, write_json
 from cflow_torch.data.log import window
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "ablation"))
-from run import of_set, pooled_figures  # noqa: E402
+from run import pooled_figures, settings_of_set  # noqa: E402
 from sets import NEAR, Item, make_item  # noqa: E402
 
 OURS = ("default", "paper", "keypoints")
@@ -87,7 +87,7 @@ def make_case(item: Item) -> Case:
 
 
 def preset(name: str, num_history: int) -> Method:
-    model = make_model(make_config(name, **of_set(name, num_history, NEAR)), "cpu")
+    model = make_model(make_config(name, **settings_of_set(name, num_history, NEAR)), "cpu")
     return lambda case: model([case.item.window])[0].numpy()["residual_flow"]
 
 
