@@ -54,15 +54,19 @@ def chosen_pairs(log: Log, data: Mapping[str, Any], count: int | None = None) ->
     chosen = range(data["first"], len(log.timestamps) - 1, data["step"])
     pairs = [index for index in log.pairs if index in chosen][:count]
     if not pairs:
-        raise CFlowError(f"data.first={data['first']}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
+        raise CFlowError(f"data.first={data['first']}: {_pairs_of(log)}")
     return pairs
 
 
 def check_pair(pair: int, log: Log) -> None:
     """Reject the index of a pair that the log does not have, or that reaches over a gap."""
     if pair not in log.pairs:
-        gaps = f", without {', '.join(map(str, sorted(log.gaps)))} (gaps)" if log.gaps else ""
-        raise CFlowError(f"pair={pair}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}{gaps}")
+        raise CFlowError(f"pair={pair}: {_pairs_of(log)}")
+
+
+def _pairs_of(log: Log) -> str:
+    gaps = f", without {', '.join(map(str, sorted(log.gaps)))} (gaps)" if log.gaps else ""
+    return f"log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}{gaps}"
 
 
 def find_logs(data: dict[str, Any]) -> Logs:

@@ -25,11 +25,12 @@ def task(cfg: Stream) -> None:
     stream = FlowStream(cfg.model, device=cfg.device, ground=None, max_gap=cfg.max_gap)
     log = open_first_log(cfg.data)
     ensure_writable(output)
-    report = {"log": log.log_id, **play(stream, log, cfg.pace, cfg.count)}
-    if not report["results"]:
+    steps = np.diff(log.sweep_times(stream.config.sweep_interval)[: cfg.count])
+    if not (steps <= cfg.max_gap).any():
         raise CFlowError(
             f"no sweep of {log.log_id} is within max_gap={cfg.max_gap:g} s of the next one: give a larger one"
         )
+    report = {"log": log.log_id, **play(stream, log, cfg.pace, cfg.count)}
     report.update(machine=machine(), versions=versions())
     print(_summary(report))
     write_json(output / "stream.json", report)

@@ -5,9 +5,9 @@
 
 moving: share of the points within 35 m, without ground, that move by at least 0.05 m per sweep. The other columns have
 the labelled points that truly move so, within 35 m and from 35 to 70 m, over all windows. error: their end-point error
-divided by their speed. missed: share of those beyond 35 m that do not move in the result. sure: share of the missed points whose
-confidence is above 0.5. "-" without labels. With `auto`, the truth is converted to the instants of the sweeps, with
-`off`, it is that of the points as measured.
+divided by their speed. missed: share of those beyond 35 m that do not move in the result. sure: share of the missed
+points whose confidence is above 0.5. "-" without labels. With `auto`, the truth is converted to the instants of the
+sweeps, with `off`, it is that of the points as measured.
 """
 
 from __future__ import annotations
