@@ -96,7 +96,7 @@ def new_folder(root: PathLike, name: str, replace: bool = False) -> Iterator[Pat
             if path.is_file():
                 _sync(path)
         try:
-            if folder.exists():  # a folder cannot take the name of one that has files
+            if replace and folder.exists():  # a folder cannot take the name of one that has files
                 os.replace(folder, older)
             os.replace(new, folder)
         except BaseException:

@@ -94,7 +94,7 @@ def recognise(root: Any) -> str:
     Raises:
         CFlowError: the path does not exist, or no format fits, or several do.
 
-    Cost: next to folders of point clouds, the first log is opened.
+    Cost: next to folders of point clouds, the first log of each format that fits is opened.
     """
     top = as_path(root)
     with remote_errors(top):
@@ -110,7 +110,7 @@ def recognise(root: Any) -> str:
                 break
             level = [path for folder in level for path in visible(folder)]
     found = [name for name in found if _has_logs(name, root)]  # nuScenes and TruckScenes have the same file names
-    if found and any(_has_clouds(path, top) for path in marked):  # folders of other data sets may be called so
+    if found and _have_clouds(marked, top):  # folders of other data sets may be called so
         errors = {name: _error_of(name, root) for name in found}
         opened = [name for name in found if not errors[name]]
         if not opened and not _error_of("arrays", root):
@@ -126,12 +126,12 @@ def recognise(root: Any) -> str:
     return found[0]
 
 
-def _has_clouds(marked: Path, top: Path) -> bool:
-    """Test whether a marked path, or a folder between it and the top, is a folder of point clouds."""
+def _have_clouds(marked: Sequence[Path], top: Path) -> bool:
+    """Test whether one of the marked paths, or a folder between it and the top, is a folder of point clouds."""
     from cflow_torch.data.arrays.folder import is_array_log
 
-    folders = [folder for folder in (marked, *marked.parents) if folder == top or top in folder.parents]
-    return any(map(is_array_log, folders))
+    around = dict.fromkeys(folder for path in marked for folder in (path, *path.parents))  # each only once
+    return any(is_array_log(folder) for folder in around if folder == top or top in folder.parents)
 
 
 def matching_paths(path: Any) -> list[Any]:

@@ -70,8 +70,10 @@ def mounting(rotation: np.ndarray, place: np.ndarray) -> Reading:
             causes.append(f"the points are turned by about {np.degrees(turn_of(rotation)):.0f} degrees")
         else:
             causes.append(f"the poses are of another sensor, whose x, y and z axes point {', '.join(names)}")
+            where = (
+                "data.ego_T_lidar, the transform from the LiDAR to it (in data=arrays with data.poses_of=sensor), with"
+            )
         fixes.append(f"a rotation of about {(np.round(rotation, 3) + 0.0).tolist()}")
-        where = "data.ego_T_lidar, the transform from the LiDAR to it (in data=arrays with data.poses_of=sensor), with"
     if place.any():
         named = [f"{axis} = {value:.1f} m" for axis, value in zip("xyz", place) if axis != "z" or abs(value) > 0.05]
         causes.append(f"the points' origin is at about {' and '.join(named)} in the frame of the poses")

@@ -339,10 +339,13 @@ def test_sensors_may_differ_by_a_digit(tmp_path, names):
 def test_some_clouds_of_a_folder_may_be_compressed(tmp_path):
     for number in range(3):
         np.save(tmp_path / f"{number}.npy", np.full((4, 3), number + 1.0))
-    (tmp_path / "1.npy.gz").write_bytes(gzip.compress((tmp_path / "1.npy").read_bytes()))
-    with pytest.raises(CFlowError, match="has several files of one name"):
-        ArraysLog(tmp_path)
-    (tmp_path / "1.npy").unlink()
+    for numbers in ([1], [0, 2]):  # one cloud, then all of them
+        for number in numbers:
+            (tmp_path / f"{number}.npy.gz").write_bytes(gzip.compress((tmp_path / f"{number}.npy").read_bytes()))
+        with pytest.raises(CFlowError, match="has several files of one name"):
+            ArraysLog(tmp_path)
+    for name in ("0.npy.gz", "1.npy", "2.npy.gz"):
+        (tmp_path / name).unlink()
     for suffix in (None, "npy", ".npy.gz"):
         assert [sweep.points[0, 0] for sweep in ArraysLog(tmp_path, suffix=suffix)] == [1, 2, 3]
 
@@ -499,6 +502,12 @@ def test_kitti_camera_poses_become_lidar_poses(tmp_path, folder):
     (folder / "calib.txt").write_text("fx 700\nP0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     with pytest.warns(CFlowWarning, match="calib.txt has no Tr, so we take the poses for those of the LiDAR"):
         assert np.array_equal(ArraysLog(folder).poses, ArraysLog(folder, calibration=None).poses)
+    mount = scenes.pose(1.3, 0.2, 0.4, 1.6)
+    for of in ("ego", "sensor"):
+        given, plain = (
+            ArraysLog(folder, ego_T_lidar=mount, poses_of=of, calibration=one).poses for one in ("auto", None)
+        )
+        assert np.array_equal(given, plain), "what you say of the poses holds"
     (folder / "calib.txt").write_text(kitti)
     tree = tmp_path / "kitti" / "sequences" / "00"  # dataset/sequences/00/velodyne and dataset/poses/00.txt
     tree.mkdir(parents=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import pickle
+import shutil
 import sys
 import uuid
 from dataclasses import replace
@@ -235,6 +236,11 @@ def test_a_folder_appears_complete_when_its_block_ends(tmp_path, monkeypatch):
     assert (tmp_path / "log" / "deep" / "a").read_bytes() == b"new" and names(tmp_path) == ("log",)
     with pytest.raises(CFlowError, match="exists already"), new_folder(tmp_path, "log"):
         pass
+    with pytest.raises(OSError), new_folder(tmp_path, "other"):
+        (tmp_path / "other").mkdir()
+        (tmp_path / "other" / "b").write_bytes(b"of another process")
+    assert names(tmp_path / "other") == ("b",)
+    shutil.rmtree(tmp_path / "other")
     with pytest.raises(KeyboardInterrupt), new_folder(tmp_path, "log", replace=True):
         raise KeyboardInterrupt
     assert (tmp_path / "log" / "deep" / "a").read_bytes() == b"new"

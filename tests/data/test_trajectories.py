@@ -974,6 +974,11 @@ def test_poses_of_seven_numbers_in_json_are_read(tmp_path, order, is_from_origin
         json.dumps({"calib": dict.fromkeys("ab", {"T": np.eye(4).tolist()}), "frames": frames})
     )
     assert np.allclose(poses_text.read_poses(tmp_path / "poses.json").poses, poses)
+    frames[3]["pose"] = [0.0] * 7  # a pose that is missing
+    for time, frame in enumerate(frames):
+        frame["time"] = 100.0 + time
+    (tmp_path / "poses.json").write_text(json.dumps(frames))
+    assert np.allclose(poses_text.read_poses(tmp_path / "poses.json").poses, np.delete(poses, 3, axis=0))
 
 
 def test_quaternions_of_one_length_are_normalised(tmp_path) -> None:

@@ -171,9 +171,9 @@ def copy_rows(source: PathLike, target: PathLike, is_kept: np.ndarray, layout: B
         CFlowError: the source cannot be read, or has another number of points.
     """
     source, target = as_path(source), as_path(target)
-    suffix = _checked_suffix(target, target.suffix.lower())
-    if suffix_of(source) != suffix:
-        raise CFlowError(f"{target} is not of the format of {source}: give a name that ends in {suffix_of(source)}")
+    suffix = _checked_suffix(source, suffix_of(source))
+    if target.suffix.lower() != suffix:
+        raise CFlowError(f"{target} is not of the format of {source}: give a name that ends in {suffix}")
     with file_errors(source, _hint(source)):
         content = read_bytes(source)
         number = len(_positions(_read(source, layout))[0])

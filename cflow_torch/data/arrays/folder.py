@@ -149,8 +149,7 @@ def _grouped(files: Sequence[Path], key: Callable[[Path], str]) -> _Kinds:
 
 
 def _pattern(path: Path) -> str:
-    stem = stem_of(path)
-    return _COUNTERS.sub("*", stem) + path.name[len(stem) :].lower()
+    return _COUNTERS.sub("*", stem_of(path)) + suffix_of(path)
 
 
 def _is_column(path: Path) -> bool:

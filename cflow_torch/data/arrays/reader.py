@@ -201,7 +201,7 @@ class ArraysLog(Log):
         if calibration == "auto" and values.keys().isdisjoint(CAMERA_KEYS):
             fix = "if they are KITTI's poses of a camera, download data_odometry_calib.zip, which has it"
             self._note(f"{chosen.name} has no Tr, so we take the poses for those of the LiDAR: {fix}")
-            return trajectory, "lidar"
+            return trajectory, poses_of
         T_cam_lidar = transform(values, chosen, *CAMERA_KEYS)
         converted = np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar
         if calibration == "auto" and _drives_along_x(trajectory.poses) and not _drives_along_x(converted):

@@ -205,7 +205,7 @@ def _numbers_of(value: Any, name: str) -> Iterator[tuple[str, str]]:
 def _name_sevens(names: list[str], words: np.ndarray) -> list[str]:
     """Return the names of columns, and name those of lists of seven numbers: a position and a quaternion, or reversed.
 
-    The quaternion has length 1 in all rows. If both ends have, it is the one that varies less.
+    The quaternion has length 1 in most rows. If both ends have, it is the one that varies less.
     """
     named = list(names)
     for name in [name for name in names if name == "0" or name.endswith(".0")]:
@@ -215,7 +215,7 @@ def _name_sevens(names: list[str], words: np.ndarray) -> list[str]:
         values = words[:, columns].astype(np.float64)
         values = values[np.isfinite(values).all(axis=1)]
         fours = {start: values[:, start : start + 4] for start in (3, 0)}
-        units = [k for k, four in fours.items() if (np.abs(np.linalg.norm(four, axis=1) - 1) < ROUNDING).all()]
+        units = [k for k, four in fours.items() if (np.abs(np.linalg.norm(four, axis=1) - 1) < ROUNDING).mean() > 0.5]
         if len(values) and units:
             start = min(units, key=lambda k: float(fours[k].std(axis=0).sum()))
             for column, found in zip(columns, (*_PLACE, *_FOUR) if start else (*_FOUR, *_PLACE)):

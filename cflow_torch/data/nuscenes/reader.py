@@ -143,7 +143,7 @@ class NuScenesLog(Log):
         self._T_ego_world = np.linalg.inv(self.poses)
 
     def _check_files(self, chain: Chain, kept: np.ndarray, step: int) -> None:
-        """Say in one error if only key frames are there, or no file of the scene. We look at three files of a kind."""
+        """Say in one error if only key frames are there, or no file of the scene. We look at a few files of a kind."""
         has = {}
         for is_key_frame in (True, False):
             rows = kept[chain.is_key_frame[kept] == is_key_frame]
