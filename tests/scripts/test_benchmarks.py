@@ -227,7 +227,7 @@ def test_every_step_can_be_left_out(script: Any, monkeypatch: pytest.MonkeyPatch
 def test_every_preset_has_the_history_and_the_region_of_a_set(script: Any) -> None:
     run = script("ablation", "run")
     for preset in PRESETS:
-        config = make_config(preset, **run.of_set(preset, 2, 35.0))
+        config = make_config(preset, **run.settings_of_set(preset, 2, 35.0))
         assert config.num_history in (0, 2) and config.point_cloud_range[3] == 35.0
 
 
