@@ -1,4 +1,4 @@
-"""Compose the settings of a command once for each choice of files, because most calls of a process choose the same ones.
+"""Compose the settings of a command once for each choice of files: most calls of a process choose the same ones.
 
 The words of a call change single values only after that, so each call gets its own copy. Without this, Hydra composes
 for 50 ms in each call, mostly to copy what no call changes.

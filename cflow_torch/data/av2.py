@@ -54,12 +54,15 @@ class GroundRaster(NamedTuple):
         """
         threshold, to_cell = GROUND_RULES[rule]
         xyz: np.ndarray = np.asarray(points, dtype=np.float64)
-        inside = np.isfinite(xyz[:, :2]).all(axis=1)
+        x_is_finite, y_is_finite = np.isfinite(xyz[:, :2]).T
+        inside = x_is_finite & y_is_finite
         position = (np.where(inside[:, None], xyz[:, :2], 0.0) @ self.rotation.T + self.translation) * self.scale
         cell = to_cell(position).astype(np.int64)
-        inside &= (cell >= 0).all(axis=1) & (cell < self.heights.shape[::-1]).all(axis=1)
+        num_rows, num_columns = self.heights.shape
+        column, row = cell.T
+        inside &= (column >= 0) & (row >= 0) & (column < num_columns) & (row < num_rows)
         height = np.full(len(xyz), np.nan)
-        height[inside] = self.heights[cell[inside, 1], cell[inside, 0]]
+        height[inside] = self.heights[row[inside], column[inside]]
         with np.errstate(invalid="ignore"):
             above = xyz[:, 2] - height
             return (np.abs(above) <= threshold) | (above < 0)

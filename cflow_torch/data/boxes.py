@@ -64,7 +64,17 @@ def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.
     `pose` is (4, 4) float64, box coordinates to the frame of the points.
     """
     local = (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3]
-    return (np.abs(local) <= np.asarray(size) / 2).all(axis=1)
+    x, y, z = (np.abs(local) <= np.asarray(size) / 2).T  # costs a tenth of `all` along the rows
+    return x & y & z  # type: ignore[no-any-return]
+
+
+def rows_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return the rows of the points inside a box, ascending. The arguments are those of `points_in_box`."""
+    # A bounding square rules out most points first.
+    apart_x, apart_y = np.abs(np.asarray(points[:, :2], np.float64) - pose[:2, 3]).T
+    reach = np.linalg.norm(size) / 2 + 1e-6
+    near = np.flatnonzero((apart_x <= reach) & (apart_y <= reach))
+    return near[points_in_box(points[near], size, pose)]  # type: ignore[no-any-return]
 
 
 class BoxLog(Log):
@@ -105,10 +115,7 @@ def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego
     is_valid = np.ones(len(start), dtype=bool)
     successor = {track: row for row, track in enumerate(boxes1.track_id)}
     for row, track in enumerate(boxes0.track_id):
-        size, pose = boxes0.size[row] + _MARGIN, boxes0.pose[row]
-        # A bounding square rules out most points first.
-        near = np.flatnonzero((np.abs(start[:, :2] - pose[:2, 3]) <= np.linalg.norm(size) / 2 + 1e-6).all(axis=1))
-        inside = near[points_in_box(start[near], size, pose)]
+        inside = rows_in_box(start, boxes0.size[row] + _MARGIN, boxes0.pose[row])
         category[inside] = boxes0.category[row]
         if track not in successor:
             is_valid[inside] = False

@@ -18,7 +18,8 @@ LEAST_SHARE = 0.1  # in place, of sweeps that fit
 MISPLACED = 0.5  # part of the usual share, below which sweeps do not fit
 _COMPARED = 300  # points of a sweep that tell whether it fits another one
 _KEY = np.array((1 << 42, 1 << 21, 1))  # of a cell: 21 bits for each of x, y and z, which varies fastest
-_OFFSETS = [int(_KEY @ (x, y, 0)) for x in (-1, 0, 1) for y in (-1, 0, 1)]  # keys of the columns around a cell
+_AROUND = (-1, 0, 1)
+_OFFSETS = np.array([_KEY @ (x, y, 0) for x in _AROUND for y in _AROUND])  # keys of the columns around a cell
 _HASH, _HASH_BITS = np.int64(0x1E3779B97F4A7C15), 20  # odd factor, whose products have their best bits on top
 _MOST = 1e5  # metres; coordinates are clamped to it, so that absurd poses do not overflow
 _COLUMN, _TALL = 0.8, 0.35  # metres, side and least height of the columns of structure; ground is flatter
@@ -109,10 +110,12 @@ class Structure:
     def __init__(self, points: np.ndarray) -> None:
         self._points = np.clip(np.asarray(points, np.float64), -_MOST, _MOST)
         # A point is in the nine columns around it, and z varies fastest in a key: one range of keys holds what is near.
-        keys = (cell_keys(np.floor(self._points / IN_PLACE).astype(np.int64))[:, None] + _OFFSETS).ravel()
-        order = np.argsort(keys)
+        own = cell_keys(np.floor(self._points / IN_PLACE).astype(np.int64))
+        rows = np.argsort(own)
+        keys = (own[rows] + _OFFSETS[:, None]).ravel()
+        order = np.argsort(keys, kind="stable")  # merges nine ascending runs
         self._keys = keys[order]
-        self._rows = order // len(_OFFSETS)  # of the point of each key
+        self._rows = rows[order % len(rows)] if len(rows) else order  # of the point of each key
         self._may_be_near = np.zeros(1 << _HASH_BITS, bool)  # by hash: a cell or one that shares its hash is near
         for step in (-1, 0, 1):
             self._may_be_near[_hash(keys + step)] = True

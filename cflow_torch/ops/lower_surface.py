@@ -23,14 +23,31 @@ def lower_surface(low: Tensor) -> Tensor:
             middle of the map, the ground is at 0.
 
     Returns:
-        (B, H, W) int32, mm, defined everywhere.
+        (B, H, W) int32, mm; undefined in empty cells.
 
     Convention: the first fit allows slopes as steep as hills, and we smooth its surface. The second fit allows gentle
     slopes relative to the smoothed surface. All numbers are integers, so the bits are the same on any device.
 
-    Cost: about sixty passes over the maps.
+    Cost: about sixty passes over the maps; on a CPU, over their part with heights.
     """
-    is_supported = _is_supported(low) & (low >= _lowest(low))
+    lowest = _lowest(low)
+    if low.device.type != "cpu":  # a GPU would wait for the rows and columns of this part
+        return _surface(low, lowest)
+    rows, cols = (_part((low < NO_HEIGHT).any(2).any(0)), _part((low < NO_HEIGHT).any(1).any(0)))
+    surface = low.new_zeros(low.shape)
+    surface[:, rows, cols] = _surface(low[:, rows, cols], lowest[rows, cols])
+    return surface
+
+
+def _part(is_known: Tensor) -> slice:
+    """Return the rows or columns from the first to the last known one, with those over which we smooth around them."""
+    known = is_known.nonzero()[:, 0].tolist() or [0]
+    return slice(max(known[0] - _SMOOTH, 0), known[-1] + _SMOOTH + 1)
+
+
+def _surface(low: Tensor, lowest: Tensor) -> Tensor:
+    """Fit the surface to maps, (B, H, W). `lowest` is that of their cells, (H, W)."""
+    is_supported = _is_supported(low) & (low >= lowest)
     hills = _box_mean(_gentlest(low.masked_fill(~is_supported, NO_HEIGHT), _STEEP))
     rest = low - hills
     # Far rings have many cells without similar neighbours. Such a cell counts unless it is far below the hills.

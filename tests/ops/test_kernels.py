@@ -15,7 +15,7 @@ from cflow_torch.ops.indices import divide, floor_divide, split_index, unique_pa
 from cflow_torch.ops.kornia_engine import close_3x3_kornia
 from cflow_torch.ops.labeling import pad
 from cflow_torch.ops.linear import adjugate, full, upper
-from cflow_torch.ops.lower_surface import _cone
+from cflow_torch.ops.lower_surface import NO_HEIGHT, _cone, _lowest, _surface, lower_surface
 from cflow_torch.ops.medians import masked_median, segment_median
 from cflow_torch.ops.nearest import nearest_set_pixel
 
@@ -73,6 +73,18 @@ def test_the_nearest_pixel_is_the_first_in_raster_order_among_ties():
             expected.append(-1 if best is None else int(np.ravel_multi_index((image, *best), seeds.shape)))
         assert nearest_set_pixel(torch.from_numpy(seeds), torch.from_numpy(pixels)).tolist() == expected
     assert nearest_set_pixel(torch.ones((1, 2, 2), dtype=torch.bool), torch.zeros(0, dtype=torch.int64)).shape == (0,)
+
+
+def test_a_surface_is_that_of_the_whole_map_where_heights_are_known():
+    generator = torch.Generator().manual_seed(0)
+    for rows, cols in ((slice(3, 30), slice(40, 90)), (slice(0, 5), slice(90, 96)), (slice(60, 61), slice(7, 8))):
+        low = torch.full((2, 80, 96), NO_HEIGHT, dtype=torch.int32)
+        part = low[:, rows, cols]
+        heights = torch.randint(-800, 3000, part.shape, dtype=torch.int32, generator=generator)
+        part.copy_(heights.masked_fill(torch.rand(part.shape, generator=generator) < 0.4, NO_HEIGHT))
+        is_known = low < NO_HEIGHT
+        assert torch.equal(lower_surface(low)[is_known], _surface(low, _lowest(low))[is_known])
+    assert lower_surface(torch.full((1, 9, 9), NO_HEIGHT, dtype=torch.int32)).shape == (1, 9, 9)
 
 
 def test_cones_are_the_highest_surfaces_of_limited_slope():

@@ -13,7 +13,7 @@ from typing import Any, Callable, Iterable, Mapping
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_file, atomic_name, remove_stale
-from cflow_torch.data.boxes import points_in_box
+from cflow_torch.data.boxes import rows_in_box
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.hdf5.reader import (
     EXTRINSIC,
@@ -185,7 +185,7 @@ def _sweep(log: Log, index: int, eval_step: int, object_ids: dict[str, int]) -> 
     if boxes is not None:
         instance = np.zeros(len(points), np.int16)  # 0 = in no box
         for track, size, T_ego_box in zip(boxes.track_id, boxes.size, boxes.pose):
-            instance[points_in_box(points, size, T_ego_box)] = object_ids.setdefault(track, len(object_ids) + 1)
+            instance[rows_in_box(points, size, T_ego_box)] = object_ids.setdefault(track, len(object_ids) + 1)
         values["flow_instance_id"] = instance
     return values
 
