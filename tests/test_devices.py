@@ -26,7 +26,13 @@ BOUNDS: dict[str, tuple[Config, int, int, int]] = {
 }
 
 
-@pytest.mark.parametrize("name", [*list(BOUNDS)[:-1], pytest.param("offline", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("paper", "keypoints", "default"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("paper, h = 4, 5 scales", "offline")),
+    ],
+)
 def test_a_device_gives_the_bits_of_the_cpu_with_few_launches(name: str) -> None:
     config, *bounds = BOUNDS[name]
     windows = windows_for(config, 4)

@@ -18,6 +18,7 @@ from cflow_torch.fleet.progress import show_warnings_as_lines
 
 MODEL = ("model=paper", "model.point_cloud_range=[-20,-20,-inf,20,20,inf]", "model.pixel_sizes=[0.4]")
 SMALL = (*MODEL, "data.check=false")
+OF_DEMO = "command: demo\nversions: {cflow_torch: 1}\n"
 
 
 @pytest.fixture
@@ -123,8 +124,13 @@ def test_clean_removes_nothing_that_it_has_not_written(tmp_path, cflow, capsys):
     assert "has the log that is to be cleaned" in capsys.readouterr().err and files_of(results) == clean
 
 
-@pytest.mark.parametrize("command", ["flow", "clean", "eval"])
-@pytest.mark.parametrize("content", ["name: mine\n", "{", "- 1\n", "command: demo\nversions: {cflow_torch: 1}\n"])
+@pytest.mark.parametrize(
+    ("command", "content"),
+    [
+        *(("flow", content) for content in ("name: mine\n", "{", "- 1\n", OF_DEMO)),
+        *((command, OF_DEMO) for command in ("clean", "eval")),
+    ],
+)
 def test_a_config_of_another_program_or_command_is_not_replaced(command, content, drives, tmp_path, cflow, capsys):
     config = tmp_path / "out" / "config.yaml"
     config.parent.mkdir()

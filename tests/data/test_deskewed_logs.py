@@ -187,7 +187,12 @@ def write_clouds(drive: Drive, folder: Path, suffix: str, unit: float = 1e9, kin
 
 
 @pytest.mark.parametrize(
-    ("suffix", "unit", "kind"), [(".pcd", 1e9, np.int32), (".ply", 1e6, np.float64), (".npy", 1e6, np.int64)]
+    ("suffix", "unit", "kind"),
+    [
+        (".pcd", 1e9, np.int32),
+        pytest.param(".ply", 1e6, np.float64, marks=pytest.mark.slow),
+        (".npy", 1e6, np.int64),
+    ],
 )
 def test_times_in_files_are_used(raw: Drive, truth: Drive, tmp_path: Path, suffix: str, unit: float, kind: Any) -> None:
     if suffix == ".pcd":
@@ -315,7 +320,7 @@ REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
     [
         ("kitti-raw/kitti-raw-0027-a", "clockwise"),
         pytest.param("kitti-raw/kitti-raw-0027-b2", "clockwise", marks=pytest.mark.slow),
-        ("kitti-raw/kitti-raw-0027-empty16", "clockwise"),
+        pytest.param("kitti-raw/kitti-raw-0027-empty16", "clockwise", marks=pytest.mark.slow),
         ("kitti-0000/kitti-0000-a", "off"),
         pytest.param("kitti-0000/kitti-0000-c2", "off", marks=pytest.mark.slow),
         ("pandaset-002/panda-002-c", "off"),

@@ -167,8 +167,19 @@ def test_large_files_are_read_in_cached_blocks(far, tmp_path, monkeypatch):
     assert paths.source_for_mmap(far(tmp_path / "a")).read() == data and Far.requests == before
 
 
-@pytest.mark.parametrize("error", [FileNotFoundError, Unreachable, asyncio.TimeoutError])
-@pytest.mark.parametrize("name", REMOTE)
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [
+        *((name, Unreachable) for name in REMOTE),
+        *(("av2", error) for error in (FileNotFoundError, asyncio.TimeoutError)),
+        *(
+            pytest.param(name, error, marks=pytest.mark.slow)
+            for name in REMOTE
+            for error in (FileNotFoundError, asyncio.TimeoutError)
+            if name != "av2"
+        ),
+    ],
+)
 def test_a_remote_error_costs_one_call(written, far, name, error, monkeypatch):
     monkeypatch.setattr(paths, "_BLOCK", 20_000)
     monkeypatch.setattr(paths, "_KEPT_BLOCKS", 1)

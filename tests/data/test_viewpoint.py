@@ -36,7 +36,11 @@ def write_drive(root, frame: str, origin: float):
 
 @pytest.mark.parametrize(
     ("frame", "origin"),
-    [("sensor", 0), ("sensor", 300), ("world", 300), pytest.param("world", 0, marks=pytest.mark.slow)],
+    [
+        ("sensor", 0),
+        ("world", 300),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("sensor", 300), ("world", 0))),
+    ],
 )
 def test_poses_are_read_and_the_frame_is_found(tmp_path, frame: str, origin: float) -> None:
     drive, poses = write_drive(tmp_path, frame, origin)

@@ -20,7 +20,7 @@ from cflow_torch.simulator import make_drive
 ENGINES = [{"correlation": "conv"}, pytest.param({"labeling": "kornia"}, marks=needs_kornia_labelling)]
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", [*range(12), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(12, 20))])
 def test_equals_the_oracle_on_random_scenes(seed):
     settings = config(
         num_history=seed % 5,

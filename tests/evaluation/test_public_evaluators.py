@@ -193,7 +193,7 @@ def made_up(kind: str, seed: int) -> public.MadeUp:
     )
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_av2_on_made_up_frames(av2_tools: ModuleType, seed: int) -> None:
     truths, predicted, frames = [], [], []
     for number, kind in enumerate(KINDS):
@@ -221,7 +221,7 @@ def run_bsfe(data_set: Any, predictions: Sequence[np.ndarray]) -> Any:
     return evaluator
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_bsfe_on_made_up_frames(bsfe: ModuleType, tmp_path: Path, seed: int) -> None:
     """Both metrics, inside 35 m and in the whole crop, without and with ground."""
     kinds = [kind for kind in KINDS if kind not in ("no points", "all ground")]

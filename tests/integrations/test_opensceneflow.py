@@ -118,8 +118,10 @@ def drive() -> list[Sweep]:
     [
         *(("dense", 2, 5), ("keypoints", 2, 5)),
         # 2 and 0: the harness repeats the first sweep in place of older ones.
-        *((*method, index) for method in (("dense", 4), ("dense", 6)) for index in (5, 2, 0)),
-        *(("verified", 6, index) for index in (4, 2, 0)),
+        *(("dense", 6, 2), ("dense", 4, 0), ("verified", 6, 4), ("verified", 6, 0)),
+        *(pytest.param("dense", 4, index, marks=pytest.mark.slow) for index in (5, 2)),
+        *(pytest.param("dense", 6, index, marks=pytest.mark.slow) for index in (5, 0)),
+        pytest.param("verified", 6, 2, marks=pytest.mark.slow),
     ],
 )
 def test_every_layout_gives_the_flow_of_the_method(variant, num_frames, index, drive):

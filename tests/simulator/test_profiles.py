@@ -63,7 +63,16 @@ def on_boxes(drive, index, is_chosen):
     return rows, world_at_shot(drive, index, returns)[rows], pose, distance
 
 
-@pytest.mark.parametrize("name", PROFILES)
+ALIKE = ("av2", "nuscenes", "truckscenes", "aevascenes")  # of these, other tests compare shots of one with brute force
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(name for name in PROFILES if name not in ALIKE),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ALIKE),
+    ],
+)
 def test_every_shot_is_on_its_ring_its_column_and_its_time(name, drives):
     drive = drives[name]
     units, sweep = drive.units(1), drive.sweep(1)

@@ -47,7 +47,7 @@ def test_equals_the_oracle(snap, num_steps):
     assert moved > 5
 
 
-@pytest.mark.parametrize("at_once", [9, 100, 1000])
+@pytest.mark.parametrize("at_once", [pytest.param(9, marks=pytest.mark.slow), 100, 1000])
 def test_chunks_do_not_change_a_bit(at_once, monkeypatch):
     scene = moving_scene(range(5), 4, 0.1)
     timed = replace(scene.points(), time=scene.points().position[0] / 10)
