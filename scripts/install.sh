@@ -38,3 +38,9 @@ if [ "$(cat "$ROOT/.venv/installed-$STAMP" 2>/dev/null || true)" != "$WANTED" ];
     echo "$WANTED" >"$ROOT/.venv/installed-demo"  # its extras are installed, too
   fi
 fi
+
+# Where the environment forbids bytecode, the demo and each process of the tests would compile torch and kornia again. So
+# they share their bytecode in the cache of pytest.
+if [ -n "${PYTHONDONTWRITEBYTECODE:-}" ]; then
+  export PYTHONDONTWRITEBYTECODE="" PYTHONPYCACHEPREFIX="$ROOT/.pytest_cache/bytecode"
+fi
