@@ -8,7 +8,6 @@ from typing import Any, Callable
 import command_line
 import hydra
 import pytest
-from composed_settings import compose_once
 from hydra.core.hydra_config import HydraConfig
 from small_logs import make_small_drive
 
@@ -41,10 +40,7 @@ def compose() -> Callable[..., Any]:
     """The settings of a command, `hydra` among them."""
 
     def settings(command: str, *overrides: str) -> Any:
-        with hydra.initialize_config_module(
-            "cflow_torch.configs", version_base="1.3"
-        ), pytest.MonkeyPatch.context() as patch:
-            compose_once(patch)
+        with hydra.initialize_config_module("cflow_torch.configs", version_base="1.3"):
             cfg = hydra.compose(command, list(overrides), return_hydra_config=True)
         HydraConfig.instance().set_config(cfg)
         return cfg
