@@ -48,6 +48,15 @@ def test_every_truncation_is_detected(tmp_path, data):
             read_cloud(file)
 
 
+@pytest.mark.parametrize("data", ("ascii", "binary"))
+def test_a_cloud_without_width_and_height_has_the_number_of_its_points(data):
+    rows = np.arange(9, dtype="<f4").reshape(3, 3)
+    body = rows.tobytes() if data == "binary" else b"0 1 2\n3 4 5\n6 7 8\n"
+    header = b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 0\nHEIGHT 0\n"
+    cloud = pcd_fields(header + f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\nDATA {data}\n".encode() + body)
+    assert np.array_equal(np.stack([cloud[axis] for axis in "xyz"], axis=1), rows)
+
+
 def test_padding_and_vector_fields_are_left_out(tmp_path):
     rows = np.zeros(2, [("x", "<f4"), ("pad", "V4"), ("normal", "<f4", 3), ("t", "<u8")])
     rows["x"], rows["normal"], rows["t"] = (1.5, np.nan), 7, (3, 2**60 + 1)

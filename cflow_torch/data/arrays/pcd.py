@@ -66,6 +66,8 @@ def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
     has_values = [int(count) > 0 for count in columns["COUNT"]]
     columns = {key: [word for word, has in zip(column, has_values) if has] for key, column in columns.items()}
     width, height = words.get("WIDTH") or words["POINTS"], words.get("HEIGHT") or ["1"]
+    if int(width[0]) * int(height[0]) == 0:  # PCL writes so the points of a cloud whose size was not set
+        width, height = words.get("POINTS") or width, ["1"]
     size = {"WIDTH": width, "HEIGHT": height}
     rest = {"VIEWPOINT": words.get("VIEWPOINT") or ["0", "0", "0", "1", "0", "0", "0"]}
     points = {"POINTS": [str(int(width[0]) * int(height[0]))], "DATA": [data[1].decode("ascii").lower()]}
