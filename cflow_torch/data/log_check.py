@@ -68,6 +68,11 @@ class _CheckedLog(CachedLog):
         return typical_sweeps(self)
 
     @cached_property
+    def is_empty(self) -> bool:
+        """Whether no typical sweep has a finite point."""
+        return not any(are_finite(as_numpy(self.sweep(index).points)).any() for index in self.typical)
+
+    @cached_property
     def frame(self) -> tuple[str, str]:
         """The reading that corrects the points, and what is wrong with them; both "" if nothing is."""
         reading, problem = frame_problem(self.sweep(self.typical[0]).points)
@@ -108,7 +113,7 @@ def find_problems(log: Log) -> list[str]:
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """
-    findings = _collect(_CheckedLog(log, _CACHED), (_found, _frame, _mask, _repeated, _lapses))
+    findings = _collect(_CheckedLog(log, _CACHED), (_found, _empty, _frame, _mask, _repeated, _lapses))
     return [finding.text for finding in findings if finding.status != RIGHT and finding.is_quick]
 
 
@@ -120,6 +125,7 @@ def examine(log: Log) -> list[Finding]:
     checks = (
         _sensor,
         _found,
+        _empty,
         _frame,
         _times,
         _poses,
@@ -153,11 +159,20 @@ def _found(log: Log) -> list[Finding]:
     return log.findings()
 
 
+def _empty(log: _CheckedLog) -> list[Finding]:
+    if not log.is_empty:
+        return []
+    names = ", ".join(map(_name_of, log.typical))
+    return [Finding("sweeps", WRONG, f"no point is finite in {names}: are the files complete?", True)]
+
+
 def _frame(log: _CheckedLog) -> list[Finding]:
     """Check a typical sweep; without poses also the last one, which is far away if points are in the world's frame.
 
     Then check the ego motion in the frame that the points will have.
     """
+    if log.is_empty:
+        return []
     reading, problem = log.frame
     checked = log.typical[0]
     is_last = not problem and known_poses(log) is None

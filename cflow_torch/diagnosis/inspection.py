@@ -101,12 +101,14 @@ def mask_problem(sweep: Sweep) -> str:
     points = as_numpy(sweep.points)[rows, :3]
     given: Any = sweep.is_ground
     mask = as_numpy(given)[rows]
-    if len(mask) and mask.all():
+    is_known = are_finite(points)
+    if not is_known.any():
+        return ""
+    if mask.all():
         return "that of all points, so no point would have flow: give masks of the ground alone, or none"
     found = as_numpy(find_ground(points))
     if not mask.any():
         return f"empty, but the sweep {_GROUND}; is_ground=None is 'unknown'" if found.any() else ""
-    is_known = are_finite(points)
     both = np.stack([found, mask])[:, is_known].astype(np.float64)
     fit = float(np.corrcoef(both)[0, 1]) if (np.ptp(both, axis=1) > 0).all() else 1.0
     if fit > _MISFIT or found[mask & is_known].mean() > _MOST_OF_MASK:  # the mask may be that of the road alone

@@ -917,10 +917,9 @@ def test_opening_a_log_warns_of_likely_mistakes(drive):
     with pytest.warns(CFlowWarning, match=f"log {drive.log_id}: .*static world moves"):
         check_log(Wrong(drive, poses=WRONG_POSES["inverted"]))
     few = Wrong(drive, points=lambda points, _: np.full((50, 3), 5.0), masks=False)
-    empty = Wrong(drive, points=lambda points, _: np.zeros((0, 3)), masks=False)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for good in (drive, few, empty, Wrong(drive, is_broken=True)):
+        for good in (drive, few, Wrong(drive, is_broken=True)):
             check_log(good)
 
 
@@ -1027,6 +1026,25 @@ def test_sweeps_without_a_finite_point_are_told_and_change_nothing_else(drive):
         warnings.simplefilter("error")
         (text,) = [one.text for one in examine(Wrong(drive, points=blank)) if one.status == WRONG]
     assert text.startswith("1 of them have few points, the first is sweep 0 with 0")
+
+
+def test_sweeps_without_points_are_told(drive):
+    with pytest.warns(CFlowWarning, match="no point is finite in the first sweep"):
+        check_log(Wrong(drive, points=lambda points, _: np.zeros((0, 3)), masks=False))
+
+
+@pytest.mark.parametrize("full", [[], [2, 5]])
+def test_sweeps_of_which_most_have_no_finite_point_are_told(drive, full):
+    class Blank(Wrong):
+        def sweep(self, index):
+            sweep = super().sweep(index)
+            return sweep if index in full else replace(sweep, points=np.full_like(sweep.points, np.nan))
+
+    log = Blank(drive)
+    quick = "no point is finite in the first sweep, sweep 5, sweep 11: are the files complete?"
+    assert find_problems(log) == ([] if full else [quick])
+    texts = [finding.text for finding in examine(log) if finding.status == WRONG]
+    assert len(texts) == 1 and texts[0].startswith("10 of them have few points" if full else quick)
 
 
 def twice(points, _):
