@@ -135,8 +135,8 @@ class ArraysLog(Log):
         points, columns = read_table(self.files[index], self._bin_columns)
         time = self.timestamps[index] if self._has_times else None
         period = float(np.median(np.diff(self.timestamps))) * 1e-9 if self._has_times else None
-        times = find_times(columns, time, period, self._note)
         is_missing = missing_returns(points)
+        times = find_times(columns, time, period, self._note, is_missing)
         if times is not None:
             is_missing |= times.is_stray
         if is_missing.any():
