@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Callable, Iterable, List
 
@@ -189,8 +190,9 @@ def _frame(log: _CheckedLog) -> list[Finding]:
         reading, problem = unit, f"{READINGS[unit].cause}, because the motion then fits that of the poses"
     fix = f"; {_setting(log, reading)} converts them" if reading else ""
     wrong = Finding("frame", WRONG, f"in {_name_of(checked)} {problem}{fix}", True)
-    # In another frame that we do not know, readings of the poses mean nothing.
-    return [wrong, *(_motion(log, reading) if reading or is_last else [])]
+    # In another frame that we do not know, readings of the poses mean nothing, and sweeps need not fit.
+    is_judged = reading or (is_last and not log.motion.is_low)
+    return [wrong, *(_motion(log, reading) if is_judged else [])]
 
 
 def _fitting(log: Log, readings: Iterable[str]) -> tuple[str, float]:
@@ -212,8 +214,9 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     # The poses are judged in the frame that the points will have.
     log: Log = ReadAs(checked, reading) if reading else checked
     judgement = judge_log(log) if reading else checked.motion
-    if not judgement.shares:
+    if not judgement.shares or (judgement.is_low and judgement.is_sparse):
         return [Finding("ego motion", RIGHT, "not compared, because the sweeps have too little static structure", True)]
+    judgement = replace(judgement, best=(NO_READING,)) if judgement.is_low else judgement
     has_poses = log.sweep(0).pose is not None
     if has_poses and judgement.best and checked.misfit:
         return checked.misfit
@@ -235,7 +238,7 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     elif name == NO_READING:
         why, fix = "", "check that the points are x, y, z in metres, and "
         of_poses = "that the poses belong to this log and are of the points' frame (else give data.ego_T_lidar), "
-        fix += f"{of_poses}their times, units and quaternions" if has_poses else "pass poses"
+        fix += f"{of_poses}their times, units and quaternions" if has_poses else "pass poses or data.odometry=true"
         fix += "" if has_poses else ", unless the files are no successive sweeps of one drive, which have no flow"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""

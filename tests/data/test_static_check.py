@@ -367,6 +367,26 @@ def test_poses_of_another_log_are_named(drive):
     assert judge_log(mixed).best == (NO_READING,) and "no reading" in find_problems(mixed)[0]
 
 
+@pytest.mark.parametrize("poses", [None, lambda _: None], ids=["poses", "no poses"])
+def test_two_sweeps_that_do_not_fit_are_told(drive, poses):
+    turn = rotations_about(2, 1.9)
+    log = Wrong(
+        drive, lambda points, pose: points if np.array_equal(pose, drive.sweep(0).pose) else points @ turn.T, poses
+    )
+    log.timestamps = log.timestamps[:2]
+    if poses is None:
+        log.poses = log.poses[:2]
+    (text,) = find_problems(log)
+    assert text.startswith("the sweeps fit under no reading (only 0.00 of the static structure is in place)")
+
+
+def test_a_share_below_that_of_sweeps_that_fit_is_told(drive):
+    rng = np.random.default_rng(0)
+    noisy = Wrong(drive, lambda points, _: points + rng.normal(0, 0.08, points.shape))
+    assert 0.04 < judge_log(noisy).given < 0.1 and not judge_log(noisy).best
+    assert "no reading" in find_problems(noisy)[0]
+
+
 @pytest.mark.parametrize(
     ("source", "side"), [pytest.param("drive", 0, marks=pytest.mark.slow), ("real", 0), ("drive", 2)]
 )
