@@ -360,6 +360,7 @@ def test_numbers_that_count_tell_no_sensors(tmp_path):
 
 def test_files_with_other_contents_are_refused(tmp_path):
     np.save(tmp_path / "flat.npy", np.zeros(9))
+    np.save(tmp_path / "depth.npy", np.ones((64, 900)))
     np.save(tmp_path / "pickle.npy", np.array([{}, 1], dtype=object), allow_pickle=True)
     np.savez(tmp_path / "two.npz", a=np.zeros((3, 3)), b=np.zeros((3, 3)))
     np.savez(tmp_path / "ragged.npz", x=np.zeros(3), y=np.zeros(2), z=np.zeros(3))

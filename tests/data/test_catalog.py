@@ -248,3 +248,12 @@ def test_labels_and_boxes_are_no_logs(tmp_path: Path) -> None:
         for number in range(2):
             np.save(tmp_path / place / f"{number}.npy", np.ones((5, 3)))
     assert find_sources("arrays", tmp_path) == [tmp_path / "scans"]
+
+
+@pytest.mark.parametrize("shape", [(64, 900), (5,), (5, 2), (900, 2)])
+def test_images_and_labels_in_arrays_are_no_logs(shape: tuple, tmp_path: Path) -> None:
+    for place, of_place in (("scans", (900, 3)), ("depth", shape)):
+        (tmp_path / place).mkdir()
+        for number in range(2):
+            np.save(tmp_path / place / f"{number}.npy", np.ones(of_place))
+    assert find_sources("arrays", tmp_path) == [tmp_path / "scans"]

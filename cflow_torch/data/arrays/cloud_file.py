@@ -27,7 +27,7 @@ SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
 """Suffixes of clouds that are read and written. Texts (`cloud_text.SUFFIXES`), and `.gz` after any, are only read."""
 _COARSEST = 1e-3  # metres
 _LARGEST_POSE = 16  # numbers of an array that may be a pose
-_MOST_CHANNELS = 16  # of an organised cloud
+_MOST_CHANNELS = 16  # of an organised cloud, or of one that is transposed; more are the rows of an image
 _MOST_COLUMNS = 64  # of a cloud with fewer points than columns; more are those of a cloud that is transposed
 _TABLES: dict[str, Any] = {  # suffix -> function that reads, and one that writes
     ".feather": (feather.read_table, feather.write_feather),
@@ -270,17 +270,30 @@ def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:
     array = _by_rows(array)
     if array.dtype.names is not None:
         return {name: array[name] for name in array.dtype.names}
-    if array.ndim != 2 or array.shape[1] < 3 or array.shape[1] > max(_MOST_COLUMNS, len(array)):
+    if not _is_table(array.shape):
         raise CFlowError(f"it has an array of shape {array.shape}; it must be (N, 3+), columns x, y, z first")
     columns = list(array.T)
     columns = columns[first_coordinate(columns) :]
     return dict(zip(default_names(len(columns)), columns))
 
 
+def may_be_cloud(shape: Sequence[int]) -> bool:
+    """Test whether an array of numbers may be a cloud by its shape, not an image, a map, or a column of labels."""
+    return len(shape) == 3 or _is_transposed(shape) or _is_table(shape)
+
+
+def _is_table(shape: Sequence[int]) -> bool:
+    return len(shape) == 2 and 3 <= shape[1] <= max(_MOST_COLUMNS, shape[0])
+
+
+def _is_transposed(shape: Sequence[int]) -> bool:
+    return len(shape) == 2 and 3 <= shape[0] <= _MOST_CHANNELS and shape[1] > _MOST_COLUMNS
+
+
 def _by_rows(array: np.ndarray) -> np.ndarray:
     """Return an organised cloud, (H, W), (H, W, C) or (C, H, W), or a transposed one, (C, N), with a row per point."""
     num_axes = 1 if array.dtype.names is not None else 2
-    if array.ndim == num_axes == 2 and 3 <= len(array) <= _MOST_COLUMNS < array.shape[1]:
+    if num_axes == 2 and _is_transposed(array.shape):
         return array.T
     if array.ndim == num_axes + 1 == 3 and 3 <= len(array) <= _MOST_CHANNELS < array.shape[2]:
         array = np.moveaxis(array, 0, -1)

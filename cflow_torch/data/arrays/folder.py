@@ -12,7 +12,7 @@ from typing import Any, Callable, Container, Dict, List, Mapping, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays import cloud_text
-from cflow_torch.data.arrays.cloud_file import SUFFIXES
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, may_be_cloud
 from cflow_torch.data.arrays.poses_text import STRUCTURED, files_of_poses, parse_poses, parse_times, read_poses
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.file_errors import file_errors
@@ -114,7 +114,7 @@ def _kinds(folder: Path) -> _Kinds:
     """
     files = [path for path in visible(folder) if stem_of(path).lower() not in _OTHER_STEMS]
     kinds = _alike([path for path in files if suffix_of(path) in SUFFIXES])
-    kinds = {kind: same for kind, same in kinds.items() if not _is_column(min(same))}
+    kinds = {kind: same for kind, same in kinds.items() if not _is_no_cloud(min(same))}
     texts = [path for path in files if suffix_of(path) in cloud_text.SUFFIXES]
     counts = Counter(map(_pattern, texts))
     texts = [] if kinds else [path for path in texts if counts[_pattern(path)] > 1]
@@ -152,8 +152,8 @@ def _pattern(path: Path) -> str:
     return _COUNTERS.sub("*", stem_of(path)) + suffix_of(path)
 
 
-def _is_column(path: Path) -> bool:
-    """Test whether a `.npy` file has one or two numbers per point, such as labels or masks."""
+def _is_no_cloud(path: Path) -> bool:
+    """Test whether a `.npy` file has no points by its shape: labels, masks, images."""
     if path.suffix.lower() != ".npy":
         return False
     try:
@@ -163,7 +163,7 @@ def _is_column(path: Path) -> bool:
             shape, _, kind = np.lib.format.read_array_header_1_0(file)
     except CFlowError:
         return False
-    return kind.kind in "biuf" and (len(shape) == 1 or (len(shape) == 2 and shape[0] > 2 and 0 < shape[1] < 3))
+    return kind.kind in "biuf" and not may_be_cloud(shape)
 
 
 def _is_text_cloud(path: Path) -> bool:
