@@ -9,13 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from command_line import cflow
+from pyarrow import csv, feather, parquet
 from small_logs import make_small_drive
 from writers import FORMATS
 
 import cflow_torch
 from cflow_torch.data.arrays import write_array_log
+from cflow_torch.data.arrays.cloud_file import read_cloud
 from cflow_torch.data.catalog import GroundSegmentedLog, Logs, find_sources, open_log, recognise, source_name
 from cflow_torch.data.log import Log, window
 from cflow_torch.simulator import Drive
@@ -257,3 +260,17 @@ def test_images_and_labels_in_arrays_are_no_logs(shape: tuple, tmp_path: Path) -
         for number in range(2):
             np.save(tmp_path / place / f"{number}.npy", np.ones(of_place))
     assert find_sources("arrays", tmp_path) == [tmp_path / "scans"]
+
+
+@pytest.mark.parametrize("suffix", [".feather", ".parquet", ".csv"])
+def test_tables_of_boxes_are_no_clouds(suffix: str, tmp_path: Path) -> None:
+    """Their times repeat, so they are not a trajectory either."""
+    names = ["timestamp_ns", "length_m", "width_m", "height_m", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"]
+    table = pa.table({name: np.full(30, 0.5) for name in names})
+    write = {".feather": feather.write_feather, ".parquet": parquet.write_table, ".csv": csv.write_csv}[suffix]
+    for name in ("objects_1", "objects_2"):
+        write(table, str(tmp_path / (name + suffix)))
+    with pytest.raises(CFlowError, match="poses or boxes"):
+        read_cloud(tmp_path / f"objects_1{suffix}")
+    with pytest.raises(CFlowError, match="no folder of point clouds"):
+        find_sources("arrays", tmp_path)

@@ -12,9 +12,10 @@ from typing import Any, Callable, Container, Dict, List, Mapping, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays import cloud_text
-from cflow_torch.data.arrays.cloud_file import SUFFIXES, may_be_cloud
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, TABLES, may_be_cloud, names_in_table
 from cflow_torch.data.arrays.poses_text import STRUCTURED, files_of_poses, parse_poses, parse_times, read_poses
 from cflow_torch.data.arrays.stamps import times_of_names
+from cflow_torch.data.column_names import are_of_poses
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders, natural_key, record_in, visible
 from cflow_torch.data.paths import PathLike, as_path, is_remote, read_start, stem_of, suffix_of
@@ -153,7 +154,9 @@ def _pattern(path: Path) -> str:
 
 
 def _is_no_cloud(path: Path) -> bool:
-    """Test whether a `.npy` file has no points by its shape: labels, masks, images."""
+    """Test whether a file has no points, by the shape of an array (labels, masks, images) or its names (poses)."""
+    if path.suffix.lower() in TABLES:
+        return are_of_poses(names_in_table(path))
     if path.suffix.lower() != ".npy":
         return False
     try:
