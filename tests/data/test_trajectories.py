@@ -252,6 +252,7 @@ LAYOUTS = {
     ],
     "printed by NumPy": [line for pose in POSES for line in str(pose).splitlines()],
     "four lines": rows(POSES.reshape(48, 4)),
+    "four lines with a time": [line for k, pose in enumerate(POSES) for line in rows([*pose[:3], (0, 0, 0, k)])],
     "radians": ["t,x,y,z,roll,pitch,yaw", *rows([(k, *POSES[k, :3, 3], *ANGLES[k]) for k in range(12)], ",")],
     "degrees": ["x y z roll_deg pitch_deg yaw_deg", *rows(DEGREES)],
     "large angles": ["id,x,y,z,roll,pitch,heading", *rows([(k, *row) for k, row in enumerate(DEGREES)], ",")],
@@ -269,6 +270,7 @@ def test_layouts_of_poses(tmp_path, layout) -> None:
         "radians",
         "time, by columns",
         "time and angles",
+        "four lines with a time",
     )
     assert (read.times_ns is not None) == has_times and (not has_times or read.times_ns[2] == 2 * 10**9)
 
