@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, Callable, Iterable, List
+from typing import Any, Callable, Iterable, Iterator, List
 
 import numpy as np
 
@@ -16,12 +17,12 @@ from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
 from cflow_torch.diagnosis.inspection import mask_problem, repeats
 from cflow_torch.diagnosis.pair import difference
-from cflow_torch.diagnosis.point_frame import frame_problem
+from cflow_torch.diagnosis.point_frame import frame_problem, tilt_problem
 from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, Judgement
 from cflow_torch.diagnosis.stillness import IN_PLACE, LEAST_SHARE, Structure, are_finite, share_of_sweeps
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.transforms import relative_transform, transform_points
-from cflow_torch.types import Sweep, as_numpy
+from cflow_torch.types import Array, Sweep, as_numpy
 
 _CACHED = 12  # sweeps that several checks read
 _STRIP = 4.0  # metres, half width of the strip whose points are looked for in the next sweep
@@ -34,6 +35,7 @@ _UNEVEN = 0.1  # change of the intervals of times from one to the next
 _EVEN = 0.5  # change of the motion over that of the intervals
 _MOST_SEEN = 20_000  # points that show in which directions a sweep measures, and whether they lie on a grid
 _DIRECTIONS = 36  # of a turn, and from straight down to straight up
+_NUM_SPREAD = 5  # sweeps that tell whether the sensor is tilted
 _LEAST_SHARED = 0.6  # share of the points in directions in which neighbouring sweeps both measure
 _FEWEST_SEEN = 300  # points that show in which directions a sweep measures
 _TOPICS = (
@@ -182,7 +184,12 @@ def _frame(log: _CheckedLog) -> list[Finding]:
         _, problem = frame_problem(log.sweep(checked).points)
     if not problem:
         right = Finding("frame", RIGHT, "metres, around the vehicle, z up", True)
-        return [right, *_motion(log, "")]
+        tilt = tilt_problem(_spread(log))
+        if not tilt:
+            return [right, *_motion(log, "")]
+        # Under a tilt, poses of the vehicle may fit under no reading.
+        is_explained = log.motion.is_low or NO_READING in log.motion.best
+        return [Finding("frame", WRONG, tilt, True), *([] if is_explained else _motion(log, ""))]
     # The unit under which the points fit the poses may be another one.
     is_unit = reading in _UNITS_OF_POINTS and known_poses(log) is not None
     unit, _ = _fitting(log, [reading, *_UNITS_OF_POINTS]) if is_unit else ("", 0)
@@ -193,6 +200,14 @@ def _frame(log: _CheckedLog) -> list[Finding]:
     # In another frame that we do not know, readings of the poses mean nothing, and sweeps need not fit.
     is_judged = reading or (is_last and not log.motion.is_low)
     return [wrong, *(_motion(log, reading) if is_judged else [])]
+
+
+def _spread(log: _CheckedLog) -> Iterator[Array]:
+    """Yield the points of a typical sweep, then of others spread over the log that can be read."""
+    others = np.linspace(0, len(log) - 1, _NUM_SPREAD).round().astype(int).tolist()
+    for index in dict.fromkeys([log.typical[0], *others]):
+        with suppress(CFlowError, OSError):
+            yield log.sweep(index).points
 
 
 def _fitting(log: Log, readings: Iterable[str]) -> tuple[str, float]:

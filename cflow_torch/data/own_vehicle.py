@@ -9,7 +9,7 @@ import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, Finding
 from cflow_torch.data.log import FlowLabels, LogWrapper, known_poses
-from cflow_torch.diagnosis.point_frame import frame_problem
+from cflow_torch.diagnosis.point_frame import frame_problem, tilt_problem
 from cflow_torch.diagnosis.stillness import IN_PLACE, Structure, are_finite, cell_keys, thinned_rows
 from cflow_torch.errors import CFlowError
 from cflow_torch.ground.segmentation import find_ground
@@ -100,7 +100,7 @@ class OwnVehicleLog(LogWrapper):
         of_all = _cells_of(np.concatenate(near))
         if rides.sum() < _FEWEST_POINTS * len(clouds) or explained[rides].mean() > _IN_PLACE:
             return nothing
-        if frame_problem(self.log.sweep(chosen[0]).points)[1]:
+        if frame_problem(sweeps[0])[1] or tilt_problem(sweeps[:1]):
             return nothing  # then other points than those of the ground were taken for ground
         cells = np.unique(of_all[rides & ~explained], axis=0)
         shares = [len(_rows_in(cells, points)) / max(are_finite(points).sum(), 1) for points in sweeps]

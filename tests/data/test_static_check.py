@@ -684,16 +684,19 @@ WRONG_POINTS = {
     "radians": (spherical(1.0), "data.read_as=points_spherical"),
     "degrees": (spherical(np.pi / 180), "data.read_as=points_spherical"),
     "elsewhere": (lambda points, _: points + [500, 0, 0], "frame of the LiDAR or of the vehicle"),
-    "pitch": (lambda points, _: points @ rotations_about(1, 0.5), "about y): give points with z up"),
+    "pitch": (lambda points, _: points @ rotations_about(1, 0.5), "about y.: give points with z up"),
     "roll": (lambda points, _: points @ rotations_about(0, -0.4), "data.ego_T_lidar"),
-    "slight pitch": (lambda points, _: points @ rotations_about(1, np.radians(8)), "8 degrees (turn it by +8 about y)"),
+    "slight pitch": (
+        lambda points, _: points @ rotations_about(1, np.radians(8)),
+        "[89] degrees .turn it by .[89] about y",
+    ),
     "slight roll": (
         lambda points, _: points @ rotations_about(0, np.radians(-12)),
-        "12 degrees (turn it by -12 about x)",
+        "12 degrees .turn it by -12 about x",
     ),
     "both": (
         lambda points, _: points @ rotations_about(1, 0.1) @ rotations_about(0, 0.15),
-        "+6 about y and +9 about x",
+        "[67] about y and .9 about x",
     ),
 }
 # Those with a factor or a rotation like that of another one.
@@ -724,14 +727,35 @@ def test_wrong_units_and_axes_are_recognised(source, name, request):
         return np.concatenate([change(points, pose), np.zeros((8, 3)), np.full((2, 3), 5.0)])
 
     masks = {"masks": False}
-    (text,) = [text for text in find_problems(Wrong(good, points=with_strays, **masks)) if "sweep" in text][:1]
-    assert found in text
+    (text,) = [
+        text for text in find_problems(Wrong(good, points=with_strays, **masks)) if re.search("sweep|tilt", text)
+    ][:1]
+    assert re.search(found, text)
     if found.startswith("about y"):
         told = float(re.findall(r"turn it by \+(\d+)", text)[0])
         assert abs(told - np.degrees(0.5)) < 3
     if "read_as=points" in found:
         again = read_as(Wrong(good, points=change, masks=False), found.split("=")[-1])
         assert judge_log(again).best == ()
+
+
+def test_a_sensor_that_tilts_for_a_moment_is_not_tilted(drive):
+    """A robot that rolls and pitches: its sweeps disagree. If they agree, the motion is judged, too."""
+
+    def tilted(angles):
+        tilts = np.stack([as_matrix(rotations_about(0, np.radians(angle))) for angle in angles])
+
+        class Tilted(Wrong):
+            def sweep(self, index):
+                sweep = super().sweep(index)
+                points = transform_points(sweep.points, np.linalg.inv(tilts[index]))
+                return replace(sweep, points=points.astype(np.float32))
+
+        return Tilted(drive, poses=lambda poses: poses @ tilts)
+
+    assert find_problems(tilted([6, -6] * 6)) == []
+    page = {finding.topic: finding for finding in examine(tilted([10] * 12))}
+    assert "tilted by about 10 degrees" in page["frame"].text and page["ego motion"].status == RIGHT
 
 
 def test_points_in_feet_are_told_by_the_motion(drive):
