@@ -568,11 +568,14 @@ def test_unknown_poses_do_not_hide_where_the_vehicle_drives(tmp_path) -> None:
 
 
 def test_numbers_of_files_tell_missing_sweeps(tmp_path) -> None:
-    """Without times, a gap is found by the numbers, unless they are irregular."""
+    """Without times, a gap is found by the numbers. If they are irregular, it is ten times as long as others."""
     for name, numbers, gaps in (
         ("missing", (0, 2, 4, 8, 10, 12, 14), {2}),
         ("whole", range(5, 12), set()),
         ("irregular", (0, 1, 3, 4, 6, 9, 10), set()),
+        ("two pairs", (94, 95, 198, 199), {1}),
+        ("three", (0, 100, 101), {0}),
+        ("irregular, with a gap", (0, 1, 3, 4, 6, 9, 30), {5}),
     ):
         log = ArraysLog(clouds(tmp_path / name, numbers))
         assert log.gaps == gaps, name

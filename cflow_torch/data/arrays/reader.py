@@ -41,6 +41,7 @@ _VIEWPOINT = "VIEWPOINT"  # source of poses that come with the clouds
 _LEAST_NAMED = 0.5  # share of the sweeps whose numbers poses have, if poses have numbers
 _LEAST_REACH = 0.8  # part of a table after which the row of the last file is, unless the layout says so
 _LEAST_USUAL = 2 / 3  # share of steps between the numbers of files that are equal, or the numbers are irregular
+_LONG_STEP = 10  # usual steps between irregular numbers; a longer one is a gap
 
 
 class ArraysLog(Log):
@@ -341,8 +342,10 @@ class ArraysLog(Log):
         """Return the indices of files without times after which others are missing, by the numbers in their names."""
         numbers = [_number_of(stem_of(path)) for path in self.files]
         steps = np.diff(numbers)
-        gaps = [gap for gap in np.flatnonzero(steps > np.median(steps)).tolist() if gap not in self.gaps]
-        if self._has_times or not gaps or not _are_regular(numbers):
+        usual = np.sort(steps)[(len(steps) - 1) // 2]
+        longest = usual if _are_regular(numbers) else _LONG_STEP * usual
+        gaps = [gap for gap in np.flatnonzero(steps > longest).tolist() if gap not in self.gaps]
+        if self._has_times or not gaps or steps.min() <= 0:
             return []
         first = self.files[gaps[0]].name
         missing = f"sweeps are missing by the numbers of its files, first after {first}"
@@ -360,7 +363,7 @@ def _of_ego(trajectory: Trajectory, whose: str, mounting: np.ndarray) -> Traject
 def _are_regular(numbers: Sequence[int]) -> bool:
     """Test whether numbers of files ascend, most by the same step."""
     steps = np.diff(numbers)
-    return bool(steps.min() > 0 and (steps == np.median(steps)).mean() > _LEAST_USUAL)
+    return bool(steps.min() > 0 and (steps == np.median(steps)).mean() >= _LEAST_USUAL)
 
 
 def _number_of(stem: str) -> int:
