@@ -60,6 +60,7 @@ _TWO_SENSORS = Finding(
     True,
 )
 _OF_SPARSE_POSES = "its poses are interpolated over several sweeps, which data.odometry=refine corrects"
+_OTHER_GROUND = "choose another method (data.find_ground=grid, patchwork or null), or give masks"
 _UNITS_OF_POINTS = [f"points_{unit}" for unit in UNITS]
 
 
@@ -293,8 +294,13 @@ def _mask(log: _CheckedLog) -> list[Finding]:
     for index in known:
         problem = "" if log.frame[1] else mask_problem(log.sweep(index))
         if problem:
-            return [Finding("ground", WRONG, f"the mask of {_name_of(index)} is {problem}", True)]
-    mask: Any = masks[known[0]]
+            text = f"the mask of {_name_of(index)} is {problem}"
+            if log.unwrapped.sweep(index).is_ground is None:  # we made it
+                mask: Any = masks[index]
+                what = "other points than those of the ground" if as_numpy(mask).any() else "no ground"
+                text = f"we find {what} in {_name_of(index)}, which has some: {_OTHER_GROUND}"
+            return [Finding("ground", WRONG, text, True)]
+    mask = masks[known[0]]
     share = float(as_numpy(mask).mean()) if len(mask) else 0.0
     return [Finding("ground", RIGHT, f"{100 * share:.0f} % of the points of {_name_of(known[0])}", True)]
 

@@ -15,7 +15,7 @@ import pytest
 from cflow_torch import CFlowError, Sweep
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.catalog import open_log
+from cflow_torch.data.catalog import GroundSegmentedLog, open_log
 from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.log import CachedLog, Log, LogWrapper, poses_beyond
 from cflow_torch.data.log_check import FOUND, RIGHT, WRONG, check_log, examine, find_problems
@@ -881,6 +881,19 @@ def test_ground_masks_of_other_rows_and_of_all_points_are_recognised(request, so
     assert "has it the rows of this sweep" in mask_problem(shifted.sweep(0))
     assert "no point would have flow" in mask_problem(Wrong(log, masks=np.ones_like).sweep(0))
     assert "empty, but the sweep contains ground" in mask_problem(Wrong(log, masks=np.zeros_like).sweep(0))
+
+
+@pytest.mark.parametrize(
+    ("share", "text"), [(0.0, "we find no ground in the first sweep"), (0.5, "we find other points than those")]
+)
+def test_a_mask_that_we_made_is_not_blamed_on_the_user(drive, monkeypatch, share, text):
+    def ground_of(points, _):
+        return np.random.default_rng(0).random(len(points)) < share
+
+    monkeypatch.setattr("cflow_torch.data.catalog.ground_of", ground_of)
+    log = GroundSegmentedLog(Wrong(drive, masks=False))
+    (problem,) = [each for each in find_problems(log) if each.startswith(text)]
+    assert "data.find_ground=grid" in problem
 
 
 def test_poses_of_the_lidar_are_told_from_those_of_the_vehicle(drive, tmp_path):
