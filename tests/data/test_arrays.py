@@ -375,9 +375,11 @@ def test_files_with_other_contents_are_refused(tmp_path):
 
 @pytest.mark.parametrize("order", "<>")
 def test_ply_reads_every_number_type(tmp_path, order):
-    names = ("char", "uint8", "int16", "ushort", "int", "uint", "float32", "float64")  # PDAL, Open3D, CloudCompare
-    kinds = [(f"p{code}", order + code) for code in ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")]
-    rows = np.frombuffer(np.random.default_rng(0).bytes(9 * 26), kinds)
+    # PDAL, Open3D, CloudCompare, pyntcloud
+    names = ("char", "uint8", "int16", "ushort", "int", "uint", "float32", "float64", "bool")
+    codes = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8", "u1")
+    kinds = [(f"p{k}", order + code) for k, code in enumerate(codes)]
+    rows = np.frombuffer(np.random.default_rng(0).bytes(9 * 27), kinds)
     properties = "".join(f"property {name} {kind[0]}\n" for name, kind in zip(names, kinds))
     word = "little" if order == "<" else "big"
     header = f"ply\nformat binary_{word}_endian 1.0\nelement vertex 9\n{properties}element face 1\nend_header\n"
