@@ -110,6 +110,12 @@ def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Pat
     assert find_sources(name, tmp_path / "b") == [tmp_path / "b"]
     with pytest.raises(CFlowError, match="nowhere is not a folder"):
         find_sources(name, tmp_path / "nowhere")
+    chain = tmp_path / "c/h/a/i/n"
+    for file in (log, log.replace("1", "2")):
+        (chain / "1/2/3" / file).parent.mkdir(parents=True, exist_ok=True)
+        (chain / "1/2/3" / file).write_bytes(b"")
+    (chain / "other").mkdir()
+    assert find_sources(name, tmp_path / "c") == [chain / "1/2/3"], "folders that are alone cost no depth"
 
 
 @pytest.mark.parametrize(
@@ -126,6 +132,8 @@ def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Pat
         (["1.pcd"], "it has one file of points"),
         (["0/points.ply", "1/points.ply"], "its 2 .ply files lie alone in their folders: put those of a log into one"),
         (["a.pcap"], "its 1 .pcap files are not read"),
+        (["a.pcap", "a.json", "b.json", "poses.txt", "times.txt"], "its 1 .pcap files are not read"),
+        (["a.osf"], "its 1 .osf files are not read"),
     ],
 )
 def test_what_is_not_read_is_said(names: list, message: str, tmp_path: Path) -> None:
