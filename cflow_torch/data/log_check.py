@@ -259,7 +259,7 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
         fix = " or ".join(judgement.reading(each).fix or _setting(log, each) for each in judgement.best)
-        fix = f"give {fix}" + (", or pass no poses" if name == STILL else "")
+        fix = f"give {fix}" + (", or no poses (data.poses=null)" if name == STILL else "")
         if name in TIMES_OF_POSES and log.trajectory is not None:
             why += " the clocks of sweeps and poses may differ, because"
     return [Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)]

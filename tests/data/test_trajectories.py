@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -505,6 +506,17 @@ def test_files_that_nobody_named_stop_no_log(tmp_path, monkeypatch) -> None:
     (numbered / "camera_timestamps.txt").write_text("\n".join([*lines, "end"]))
     with pytest.warns(CFlowWarning, match=r"we do not use camera_timestamps\.txt"):
         assert not ArraysLog(numbered)._has_times
+
+
+def test_what_is_wrong_with_a_file_of_poses_is_told_once(tmp_path, monkeypatch) -> None:
+    folder = clouds(tmp_path / "drive")
+    lines = [line(k, seconds(START + k * 10**6)) for k in range(500)]
+    (folder / "poses_gt.txt").write_text("\n".join([*lines, line(9, seconds(START))]))
+    monkeypatch.chdir(tmp_path)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        assert ArraysLog(folder.name).poses is None
+    assert len([each for each in told if "we do not use poses_gt.txt" in str(each.message)]) == 1
 
 
 def locked(path: Any) -> Any:

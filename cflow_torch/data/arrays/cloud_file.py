@@ -255,7 +255,7 @@ def _read(path: Path, bin_columns: int | BinLayout | None) -> Mapping[str, np.nd
     if len(content) % layout.step:
         raise CFlowError(
             f"it has {len(content)} bytes, not a multiple of {layout.step} ({layout}): it is truncated, or has another "
-            "number of columns (bin_columns: 4 in KITTI, 5 in nuScenes)"
+            "number of columns (data.bin_columns=4 in KITTI, 5 in nuScenes)"
         )
     return _array_columns(layout.table(content))
 

@@ -199,7 +199,8 @@ def find_clouds(folder: Path, suffix: str | None) -> list[Path]:
             f"({suffix or ', '.join((*SUFFIXES, *cloud_text.SUFFIXES))}); scene flow needs two or more"
         )
     if len(kinds) > 1:
-        raise CFlowError(f"{parent} has several kinds of clouds, {', '.join(sorted(kinds))}: choose one by suffix=...")
+        choose = f"choose one, such as data.suffix='{min(kinds)}'"
+        raise CFlowError(f"{parent} has several kinds of clouds, {', '.join(sorted(kinds))}: {choose}")
     files = sorted(next(iter(kinds.values())), key=lambda path: natural_key(stem_of(path)))
     twice = next((one for one, other in zip(files, files[1:]) if stem_of(one) == stem_of(other)), None)
     if twice is not None:
@@ -226,7 +227,7 @@ def only_one(found: Sequence[Path], folder: Path, what: str) -> Path | None:
     """Return the only file that was found; None = none. Several are a `CFlowError`."""
     if len(found) > 1:
         several = ", ".join(path.name for path in found)
-        raise CFlowError(f"{folder} has several files for {what}: {several}; choose one with {what}=...")
+        raise CFlowError(f"{folder} has several files for {what}: {several}; choose one with data.{what}=FILE")
     return found[0] if found else None
 
 
@@ -282,9 +283,12 @@ def find_poses(
     named = only_one(called, folder, "poses")
     if named is not None or kitti.exists():
         return read_poses(named or kitti)
-    read = read_all([path for each in folders for path in find_pose_files(each, clouds)], read_poses, tell)
+    files = [path for each in folders for path in find_pose_files(each, clouds)]
+    read = read_all(files, read_poses, tell)
     found = {path: each for path, each in read.items() if fits(each)}
-    near = None if found else find_poses_near(folder, top.name, times_ns, fits, tell, clouds)
+    # Files that were read here are not read again there, so what is wrong with them is told once.
+    known = {*clouds, *(path.resolve() for path in files)}
+    near = None if found else find_poses_near(folder, top.name, times_ns, fits, tell, known)
     if near is not None:
         return near
     found = found or {path: each for path, each in read.items() if suffix_of(path) in _NEAR_TABLES}

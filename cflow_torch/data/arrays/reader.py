@@ -326,7 +326,7 @@ class ArraysLog(Log):
             if given is None:
                 raise CFlowError(
                     f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, or poses "
-                    "with times (TUM) and the times of the sweeps in times.txt, or no poses"
+                    "with times (TUM) and the times of the sweeps in times.txt, or none (data.poses=null)"
                 )
             rows = given
             is_known = np.isfinite(trajectory.poses[rows]).all(axis=(1, 2)) & (rows >= 0)
@@ -381,7 +381,7 @@ def _drives_along_x(poses: np.ndarray) -> bool:
 
 def _read_mask(folder: Path, stem: str, rows: int) -> np.ndarray:
     file = folder / f"{stem}.npy"
-    mask = read_npy(file, "every sweep needs its ground mask, or pass ground=None")
+    mask = read_npy(file, "every sweep needs its ground mask, or set data.ground=null")
     if mask.shape not in ((rows,), (rows, 1)) or mask.dtype.kind not in "biu" or not np.isin(mask, (0, 1)).all():
         raise CFlowError(f"{file} has shape {mask.shape} and dtype {mask.dtype} for {rows} points; masks are (N,) bool")
     return mask.reshape(rows).astype(bool)
