@@ -85,6 +85,18 @@ class _CheckedLog(CachedLog):
         return reading, problem
 
     @cached_property
+    def tilt(self) -> str:
+        """By how much the sensor is tilted, if nothing else is wrong with the points; "" = it is not."""
+        return "" if self.frame[1] else tilt_problem(self._spread())
+
+    def _spread(self) -> Iterator[Array]:
+        """Yield the points of a typical sweep, then of others spread over the log that can be read."""
+        others = np.linspace(0, len(self) - 1, _NUM_SPREAD).round().astype(int).tolist()
+        for index in dict.fromkeys([self.typical[0], *others]):
+            with suppress(CFlowError, OSError):
+                yield self.sweep(index).points
+
+    @cached_property
     def motion(self) -> Judgement:
         """How well readings of the poses fit the points as they are."""
         return self.judgement or judge_log(self)
@@ -185,12 +197,12 @@ def _frame(log: _CheckedLog) -> list[Finding]:
         _, problem = frame_problem(log.sweep(checked).points)
     if not problem:
         right = Finding("frame", RIGHT, "metres, around the vehicle, z up", True)
-        tilt = tilt_problem(_spread(log))
-        if not tilt:
+        if not log.tilt:
             return [right, *_motion(log, "")]
         # Under a tilt, poses of the vehicle may fit under no reading.
-        is_explained = log.motion.is_low or NO_READING in log.motion.best
-        return [Finding("frame", WRONG, tilt, True), *([] if is_explained else _motion(log, ""))]
+        has_misfit = log.motion.is_low or NO_READING in log.motion.best
+        is_explained = has_misfit and known_poses(log) is not None
+        return [Finding("frame", WRONG, log.tilt, True), *([] if is_explained else _motion(log, ""))]
     # The unit under which the points fit the poses may be another one.
     is_unit = reading in _UNITS_OF_POINTS and known_poses(log) is not None
     unit, _ = _fitting(log, [reading, *_UNITS_OF_POINTS]) if is_unit else ("", 0)
@@ -201,14 +213,6 @@ def _frame(log: _CheckedLog) -> list[Finding]:
     # In another frame that we do not know, readings of the poses mean nothing, and sweeps need not fit.
     is_judged = reading or (is_last and not log.motion.is_low)
     return [wrong, *(_motion(log, reading) if is_judged else [])]
-
-
-def _spread(log: _CheckedLog) -> Iterator[Array]:
-    """Yield the points of a typical sweep, then of others spread over the log that can be read."""
-    others = np.linspace(0, len(log) - 1, _NUM_SPREAD).round().astype(int).tolist()
-    for index in dict.fromkeys([log.typical[0], *others]):
-        with suppress(CFlowError, OSError):
-            yield log.sweep(index).points
 
 
 def _fitting(log: Log, readings: Iterable[str]) -> tuple[str, float]:
@@ -292,7 +296,7 @@ def _mask(log: _CheckedLog) -> list[Finding]:
     if not known:
         return [Finding("ground", RIGHT, "no masks, so no point is taken for ground (data.find_ground=grid finds it)")]
     for index in known:
-        problem = "" if log.frame[1] else mask_problem(log.sweep(index))
+        problem = "" if log.frame[1] or log.tilt else mask_problem(log.sweep(index))
         if problem:
             text = f"the mask of {_name_of(index)} is {problem}"
             if log.unwrapped.sweep(index).is_ground is None:  # we made it

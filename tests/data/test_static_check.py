@@ -754,6 +754,8 @@ def test_a_sensor_that_tilts_for_a_moment_is_not_tilted(drive):
         return Tilted(drive, poses=lambda poses: poses @ tilts)
 
     assert find_problems(tilted([6, -6] * 6)) == []
+    (problem,) = find_problems(tilted([25] * 12))
+    assert "tilted by about 25 degrees" in problem, "and nothing else"
     page = {finding.topic: finding for finding in examine(tilted([10] * 12))}
     assert "tilted by about 10 degrees" in page["frame"].text and page["ego motion"].status == RIGHT
 
