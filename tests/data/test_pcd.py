@@ -60,7 +60,9 @@ def test_a_cloud_without_width_and_height_has_the_number_of_its_points(data):
 
 def test_fields_of_a_text_that_are_characters_are_left_out_and_said(tmp_path):
     """PCL writes a byte as a character: also blanks, ends of lines, and NUL."""
-    rows = [b"%d.5 %d -nan(ind) 7 %c %c" % (k, 2 * k, tag, k % 3) for k, tag in enumerate((16, 32, 10, 9, 0, 48, 255))]
+    rows = [
+        b"%d.5 %d -nan(ind) 7.000 %c %c" % (k, 2 * k, tag, k % 3) for k, tag in enumerate((16, 32, 10, 9, 0, 48, 255))
+    ]
     header = (
         b"FIELDS x y z intensity tag line\nSIZE 4 4 4 2 1 1\nTYPE F F F U U U\nCOUNT 1 1 1 1 1 1\nWIDTH 7\nHEIGHT 1\n"
     )

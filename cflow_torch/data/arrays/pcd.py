@@ -73,10 +73,18 @@ def _text_fields(body: bytes, header: Mapping[str, Sequence[str]]) -> dict[str, 
 
 def _numbers(words: Sequence[bytes], kind: np.dtype[Any]) -> np.ndarray:
     """Return the numbers in words; those that the type does not have are a ValueError."""
-    numbers = np.array(words, np.bytes_).astype(kind if kind.kind == "f" or kind == np.uint64 else np.int64)
-    if kind.kind in "iu" and not np.array_equal(numbers.astype(kind), numbers):
+    texts = np.array(words, np.bytes_)
+    if kind.kind == "f":
+        return texts.astype(kind)
+    try:
+        numbers = texts.astype(np.uint64 if kind == np.uint64 else np.int64)
+    except ValueError:
+        numbers = texts.astype(np.float64)  # 7.000000
+    with np.errstate(invalid="ignore"):  # of NaN, which is found below
+        found = numbers.astype(kind)
+    if not np.array_equal(found, numbers):
         raise ValueError(f"it has numbers that {kind.name} does not have")
-    return numbers.astype(kind)
+    return found
 
 
 def pcd_viewpoint(content: bytes) -> np.ndarray | None:
