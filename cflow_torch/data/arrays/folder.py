@@ -115,7 +115,7 @@ def _kinds(folder: Path) -> _Kinds:
     """
     files = [path for path in visible(folder) if stem_of(path).lower() not in _OTHER_STEMS]
     kinds = _alike([path for path in files if suffix_of(path) in SUFFIXES])
-    kinds = {kind: same for kind, same in kinds.items() if not _is_no_cloud(min(same))}
+    kinds = {kind: same for kind, same in kinds.items() if not _has_no_points(min(same))}
     texts = [path for path in files if suffix_of(path) in cloud_text.SUFFIXES]
     counts = Counter(map(_pattern, texts))
     texts = [] if kinds else [path for path in texts if counts[_pattern(path)] > 1]
@@ -153,7 +153,7 @@ def _pattern(path: Path) -> str:
     return _COUNTERS.sub("*", stem_of(path)) + suffix_of(path)
 
 
-def _is_no_cloud(path: Path) -> bool:
+def _has_no_points(path: Path) -> bool:
     """Test whether a file has no points, by the shape of an array (labels, masks, images) or its names (poses)."""
     if path.suffix.lower() in TABLES:
         return are_of_poses(names_in_table(path))
