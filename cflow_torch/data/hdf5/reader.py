@@ -19,6 +19,7 @@ from cflow_torch.data.point_times import find_times
 from cflow_torch.errors import CFlowError, MissingFile, import_optional
 from cflow_torch.transforms import poses_from_quaternions, rigid_transform
 from cflow_torch.types import Sweep
+from cflow_torch.windows.returns import missing_returns
 
 # Time stamps count from 1970 or 1980: smaller ones are microseconds (16 digits), others nanoseconds (18 or 19).
 _FIRST_NANOSECOND = 10**17
@@ -119,7 +120,7 @@ class HDF5Log(Log):
         if times is None or np.abs(times).max(initial=0) <= _LONGEST_LAG:
             return times if times is None else times.astype(np.float32)
         period = None if time is None else float(np.median(np.diff(self.timestamps))) * 1e-9
-        found = find_times({"time": times}, time, period, self._note)
+        found = find_times({"time": times}, time, period, self._note, missing_returns(points[:, :3]))
         if found is None or found.seconds is None:
             return None
         points[found.is_stray] = np.nan
