@@ -21,7 +21,7 @@ _NEAR = 0.5  # metres, rows and columns to a moving pixel
 _LOWEST = 10  # centimetres above the mean of the ground around; lower points are ground
 
 
-def pixels_of_low_points(sweeps: HeightSlicedSweeps, is_moving: Tensor) -> tuple[Tensor, Tensor]:
+def find_low_points(sweeps: HeightSlicedSweeps, is_moving: Tensor) -> tuple[Tensor, Tensor]:
     """Find the points of t that are not drawn, but near a moving pixel.
 
     Args:

@@ -67,6 +67,11 @@ def _without_coverage(batch: Any, *given: Any) -> HeightSlicedSweeps:
     return HeightSlicedSweeps.of(replace(batch, coverage=None), *given)
 
 
+def _no_low_points(sweeps: HeightSlicedSweeps, is_moving: Tensor) -> tuple[Tensor, Tensor]:
+    none = torch.zeros(0, dtype=torch.int64, device=is_moving.device)
+    return none, none
+
+
 def _no_dissent(sweeps: Any, tree: Any, verdict: Any, winner: Tensor, significance: float, price: int) -> Dissent:
     return Dissent(winner, torch.full_like(winner, -1))
 
@@ -87,6 +92,7 @@ STEPS: dict[str, dict[str, Any]] = {
     "no price of an object": {"select_objects": partial(selection.select_objects, price=0)},
     "no dissent": {"select_objects": partial(selection.select_objects, dissent=_no_dissent)},
     "no margin": {"motion_margin": _without_margin},
+    "no low points": {"find_low_points": _no_low_points},
     "no registration": {"refine": partial(refinement.refine, num_iterations=0)},
     "no slow objects of pairs": {"refine": partial(refinement.refine, slow=_nothing_is_slow)},
     "long vehicles are static": {"movable_nodes": partial(component_tree.movable_nodes, ends_move=_no_ends_move)},

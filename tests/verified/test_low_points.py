@@ -9,8 +9,8 @@ from scenes import flow_as_oracle
 from turning_car import MODEL, turning_car
 
 from cflow_torch import Sweep, VerifiedFlow, Window
-from cflow_torch.verified import rigid_motion
 from cflow_torch.verified.confidence import TABLE
+from cflow_torch.verified.low_points import find_low_points
 
 STEP = 0.6  # metres that the car moves
 LOW = slice(-16, None)  # the points of the low row come last
@@ -54,13 +54,13 @@ def test_low_points_in_front_of_a_static_car_are_static():
 @pytest.mark.parametrize("num_history", [0, 2])
 def test_equals_the_oracle_with_low_points(num_history, monkeypatch):
     counts = []
-    pixels_of_low_points = rigid_motion.pixels_of_low_points
 
     def counted(*args):
-        counts.append(len((found := pixels_of_low_points(*args))[0]))
-        return found
+        row, pixel = find_low_points(*args)
+        counts.append(len(row))
+        return row, pixel
 
-    monkeypatch.setattr(rigid_motion, "pixels_of_low_points", counted)
+    monkeypatch.setattr(VerifiedFlow, "find_low_points", staticmethod(counted))
     for seed in (1, 5):
         flow_as_oracle(turning_car(seed, num_history), MODEL.replace(num_history=num_history))
     assert min(counts) >= 1
