@@ -16,6 +16,7 @@ from tiny_recording import TinyRecording
 from cflow_torch import CFlowError
 from cflow_torch.data.bags import BagLog, find_bags
 from cflow_torch.data.bags.messages import cloud_columns, points_of
+from cflow_torch.data.bags.reader import _parts
 from cflow_torch.data.catalog import open_log, recognise
 from cflow_torch.transforms import as_matrix
 from cflow_torch.types import CFlowWarning
@@ -99,6 +100,18 @@ def test_parts_of_a_bag_are_joined(tmp_path) -> None:
     assert find_bags(tmp_path) == [tmp_path / "drive_0.bag"]
     log = BagLog(tmp_path / "drive_0.bag")
     assert log.log_id == "drive" and len(log) == 8 and world(log, part.recording) < 5e-3
+
+
+def test_parts_are_joined_if_their_names_have_their_times(tmp_path) -> None:
+    """As rosbag record --split names them; two recordings follow each other, and two others ran at a time."""
+    drive = [f"2024-01-05-10-0{minute}-00_{number}.bag" for minute, number in enumerate((0, 1, 2, 0, 1))]
+    mixed = [f"run_2024-01-05-10-0{minute}-00_{number}.bag" for minute, number in enumerate((0, 0, 1, 1))]
+    for name in (*drive, *mixed):
+        (tmp_path / name).touch()
+    found = [path.name for path in find_bags(tmp_path)]
+    assert found == [drive[0], drive[3], *mixed]
+    assert [path.name for path in _parts(tmp_path / drive[0])] == drive[:3]
+    assert [path.name for path in _parts(tmp_path / drive[3])] == drive[3:]
 
 
 def test_folders_without_or_with_old_metadata_are_read(tmp_path) -> None:

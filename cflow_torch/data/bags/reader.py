@@ -26,6 +26,7 @@ from cflow_torch.types import Sweep
 SUFFIXES = (".bag", ".mcap", ".db3")
 _ACTIVE = ".active"  # of a recording that was not finished
 _PART = re.compile("(.+)_([0-9]+)")  # recorders number the parts of a bag from 0
+_START = re.compile("[0-9]{4}(-[0-9]{2}){5}")  # of a part, in names by rosbag record --split
 SEARCH_DEPTH = 3
 _CLOUD = "sensor_msgs/msg/PointCloud2"
 _LIVOX = tuple(f"{name}/msg/CustomMsg" for name in ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces"))
@@ -61,7 +62,8 @@ def find_bags(root: PathLike) -> list[Path]:
     """Find all bags in a folder, at most three levels down, sorted; or return the given bag.
 
     Bags are files `.bag` (ROS 1), `.mcap`, `.db3`, and folders with a metadata.yaml (ROS 2). Files drive_0.bag,
-    drive_1.bag, ... are the parts of one bag. It is called by its first part, and `BagLog` opens them all.
+    drive_1.bag, ... are the parts of one bag, also if the time of each part is in its name. The bag is called by its
+    first part, and `BagLog` opens them all.
     """
     root = as_path(root)
     if root.is_file():
@@ -491,12 +493,31 @@ def _parts(path: Path) -> list[Path]:
     match = _PART.fullmatch(path.stem)
     if match is None or int(match[2]) != 0:
         return [path]
-    others = [file for file in path.parent.glob(f"*{path.suffix}") if file.stem.startswith(f"{match[1]}_")]
-    numbered = {_part_number(file): file for file in others if _PART.fullmatch(file.stem)}
     parts = [path]
-    while len(parts) in numbered:
-        parts.append(numbered[len(parts)])
+    for file in _parts_after(path):
+        if _part_number(file) == len(parts):
+            parts.append(file)
     return parts
+
+
+def _parts_after(path: Path) -> list[Path]:
+    """Return the files that may be parts of the bag with this first part, in the order of their numbers."""
+    name, first = _recording(path)
+    others = [file for file in path.parent.glob(f"*{path.suffix}") if _PART.fullmatch(file.stem)]
+    starts = {file: start for file in others for each, start in [_recording(file)] if each == name}
+    later = [start for file, start in starts.items() if _part_number(file) == 0 and start > first]
+    after = [file for file, start in starts.items() if start >= first and not any(start >= each for each in later)]
+    numbers = [_part_number(file) for file in after]
+    # Two files of one number are of two recordings at a time, if their names have times.
+    return sorted((file for file in after if not first or numbers.count(_part_number(file)) == 1), key=_part_number)
+
+
+def _recording(file: Path) -> tuple[str, str]:
+    """Return the name of a file without its number and time, which its parts share, and the time, "" = none."""
+    match = _PART.fullmatch(file.stem)
+    stem = match[1] if match else file.stem
+    start = _START.search(stem)
+    return _START.sub("", stem, count=1), start[0] if start else ""
 
 
 def _part_number(file: Path) -> int:
