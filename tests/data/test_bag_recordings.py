@@ -145,6 +145,27 @@ def test_a_missing_link_is_named(tmp_path) -> None:
     assert log.frame == "base_link" and world(log, bag.recording) < 5e-3
 
 
+def test_transforms_connect_frames_in_either_direction(tmp_path) -> None:
+    """The vehicle below its LiDAR, and the frame of the world below the vehicle, as KISS-ICP publishes it."""
+    mounted = Recorder(tmp_path / "mount")
+    mounted.transform(mounted.stamps[0], "velodyne", "base_link", np.linalg.inv(MOUNT))
+    mounted.drive()
+    mounted.clouds()
+    log = BagLog(mounted.close())
+    assert log.frame == "base_link" and world(log, mounted.recording) < 5e-3 and not log.notes
+    for name, vehicle in (("vehicle", "base_link"), ("lidar", "velodyne")):
+        bag = Recorder(tmp_path / name)
+        bag.mount()
+        for stamp in range(bag.stamps[0] - 10**8, bag.stamps[-1] + 10**8, STEP):
+            T = bag.recording.pose_at(stamp) @ (MOUNT if vehicle == "velodyne" else np.eye(4))
+            bag.transform(stamp, vehicle, "odom_lidar", np.linalg.inv(T))
+        bag.clouds()
+        path = bag.close()
+        with pytest.warns(CFlowWarning, match=f"from {vehicle} to odom_lidar, so we invert them"):
+            log = BagLog(path)
+        assert log.frame == "base_link" and world(log, bag.recording) < 5e-3
+
+
 def test_an_odometry_of_a_frame_below_the_lidar_is_connected(tmp_path, recwarn) -> None:
     """As of an inertial unit in the LiDAR, whose driver publishes where it is."""
     bag = Recorder(tmp_path)

@@ -312,6 +312,9 @@ class BagLog(Log):
         self._note(
             f"frames have several parents: we ignore the transforms that are rarer, {ignored}" if ignored else ""
         )
+        if self._frames.inverted_world:
+            world, vehicle = self._frames.inverted_world
+            self._note(f"its transforms are those from {vehicle} to {world}, so we invert them to get poses in {world}")
         return self._timed(stamps), tracks
 
     def _add_transforms(self, message: Any, arrived: int, links: dict[tuple[str, str], list[Sample]]) -> None:
