@@ -14,7 +14,7 @@ from cflow_torch.data.camera import Camera
 from cflow_torch.data.finding import Finding
 from cflow_torch.diagnosis.pair import LEAST_DISTANCE, is_around
 from cflow_torch.diagnosis.readings import Judgement
-from cflow_torch.errors import MissingFile, warn
+from cflow_torch.errors import warn
 from cflow_torch.transforms import poses_at
 from cflow_torch.types import CFlowError, Sweep, Window, as_numpy, check_array
 
@@ -350,7 +350,7 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
     """Read the window for the flow from sweep `index` to sweep `index + 1`.
 
     It has fewer than `num_history` older or `num_future` later sweeps at the ends of the log, at its gaps and, with a
-    warning, at a sweep whose file is missing. A pair that cannot be read is a `CFlowError`.
+    warning, at a sweep that cannot be read. A pair that cannot be read is a `CFlowError`.
     """
     count = len(log.timestamps)
     if not 0 <= index < count - 1:
@@ -362,13 +362,13 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
 
 
 def _readable(log: Log, indices: range) -> Iterator[Sweep]:
-    """Yield the sweeps of a history or future, up to a gap of the log or a sweep whose file is missing."""
+    """Yield the sweeps of a history or future, up to a gap of the log or a sweep that cannot be read."""
     for index in indices:
         if (index if indices.step < 0 else index - 1) in log.gaps:
             return
         try:
             sweep = log.sweep(index)
-        except MissingFile as error:
+        except CFlowError as error:
             warn(f"log {log.log_id}: windows near sweep {index} are shorter, because {error}")
             return
         yield sweep

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Callable, Iterable, List
 
 import numpy as np
@@ -348,7 +348,8 @@ def _each_sweep(log: _CheckedLog) -> list[Finding]:
     """Read every sweep: find those that cannot be read, have few points, repeat the one before, or are misplaced."""
     log.sweep(0)  # its error is that of the log
     neighbours = Neighbours.of(log, range(len(log)))
-    return [*_unreadable(neighbours), *_small(neighbours), *_misplaced(log, neighbours)]
+    misplaced = _collect(log, [partial(_misplaced, neighbours=neighbours)])  # may need a sweep that cannot be read
+    return [*_unreadable(neighbours), *_small(neighbours), *misplaced]
 
 
 def _unreadable(neighbours: Neighbours) -> list[Finding]:

@@ -214,6 +214,9 @@ def test_a_missing_sweep_shortens_windows_and_fails_its_pairs(tmp_path) -> None:
         found = window(log, 7, 4)
     assert [sweep.points[0, 0] for sweep in found.pch] == [7] and isinstance(found.pc0, Sweep)
     assert len(window(log, 1, 4, 4).pcf) == 2 and len(window(log, 10, 4).pch) == 4
+    (tmp_path / f"{STAMPS[5]}.npy").write_bytes((tmp_path / "5.moved").read_bytes()[:100])
+    with pytest.warns(CFlowWarning, match="windows near sweep 5 are shorter, because .* truncated or damaged"):
+        assert len(window(log, 7, 4).pch) == 1
 
 
 def test_a_vehicle_that_stands_has_a_pose_in_every_line(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argove
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, source_for_random_access
 from cflow_torch.data.point_times import find_times
-from cflow_torch.errors import CFlowError, MissingFile, import_optional
+from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.transforms import poses_from_quaternions, rigid_transform
 from cflow_torch.types import Sweep
 
@@ -110,7 +110,7 @@ class HDF5Log(Log):
             pose = rigid_transform(pose, f"pose of sweep {self.sweep_name(index)} in {self.file}") @ self.ego_T_lidar
         time = None if self.timestamps[-1] < _FIRST_MICROSECOND else timestamp  # None: the groups are numbered
         if pose is not None and not np.isfinite(pose).all():
-            raise MissingFile(f"{self.file}: the pose of sweep {self.sweep_name(index)} is not finite")
+            raise CFlowError(f"{self.file}: the pose of sweep {self.sweep_name(index)} is not finite")
         return Sweep(points[:, :3], is_ground, pose, time, self._point_times(index, time, points))
 
     def _point_times(self, index: int, time: int | None, points: np.ndarray) -> np.ndarray | None:
