@@ -645,7 +645,16 @@ def test_single_poses_that_are_off_are_found(drive):
         poses[7:, 1, 3] += 1.5
         return poses
 
-    for change, index, kind in ((glitch, 6, POSE), (turned, 6, POSE), (jump, 7, JUMP)):
+    def small(index):
+        def change(poses):
+            poses = poses.copy()
+            poses[index, 0, 3] += 0.3
+            return poses
+
+        return change
+
+    ends = (small(0), 1, JUMP), (small(11), 11, JUMP)
+    for change, index, kind in ((glitch, 6, POSE), (turned, 6, POSE), (jump, 7, JUMP), (small(5), 5, POSE), *ends):
         (lapse,) = find_lapses(Wrong(drive, poses=change))
         assert (lapse.sweep, lapse.kind) == (index, kind)
     assert "jump by 1.5 m before sweep 7" in find_problems(Wrong(drive, poses=jump))[0]
