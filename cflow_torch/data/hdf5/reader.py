@@ -9,6 +9,7 @@ from typing import Any, Sequence
 
 import numpy as np
 
+from cflow_torch.data.arrays.cloud_file import in_single
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import visible
@@ -19,6 +20,7 @@ from cflow_torch.data.point_times import find_times
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.transforms import poses_from_quaternions, rigid_transform
 from cflow_torch.types import Sweep
+from cflow_torch.windows.returns import missing_returns
 
 # Time stamps count from 1970 or 1980: smaller ones are microseconds (16 digits), others nanoseconds (18 or 19).
 _FIRST_NANOSECOND = 10**17
@@ -96,9 +98,16 @@ class HDF5Log(Log):
         self._scene.close()
 
     def sweep(self, index: int) -> Sweep:
-        """Read sweep `index`: float32 points, float64 pose of their frame; ground mask and times if stored."""
+        """Read sweep `index`: points, float64 pose of their frame; ground mask and times if stored.
+
+        Points are float32, but float64 in the frame of a map that is too far for float32. `missing_returns` are NaN.
+        """
         rows, timestamp = self._rows(index), self.timestamps[index]
-        points = self._values(index, "lidar", None, np.float32)
+        points = self._values(index, "lidar")[:, :3]
+        points = points if points.dtype == np.float64 else points.astype(np.float32)
+        is_missing = missing_returns(points)
+        if is_missing.any():
+            points = np.where(is_missing[:, None], points.dtype.type(np.nan), points)
         is_ground = self._values(index, "ground_mask", rows, np.bool_)
         pose = self._stored_pose(index)
         if pose is None and self._needs_poses:
@@ -111,7 +120,8 @@ class HDF5Log(Log):
         time = None if self.timestamps[-1] < _FIRST_MICROSECOND else timestamp  # None: the groups are numbered
         if pose is not None and not np.isfinite(pose).all():
             raise CFlowError(f"{self.file}: the pose of sweep {self.sweep_name(index)} is not finite")
-        return Sweep(points[:, :3], is_ground, pose, time, self._point_times(index, time, points))
+        times = self._point_times(index, time, points)
+        return Sweep(in_single(points), is_ground, pose, time, times)
 
     def _point_times(self, index: int, time: int | None, points: np.ndarray) -> np.ndarray | None:
         """Read the (N,) seconds from the sweep to its points; those of another unit or clock are converted."""
