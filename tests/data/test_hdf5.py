@@ -288,6 +288,8 @@ def test_points_in_a_map_keep_their_precision_and_fillers_are_missing(tmp_path):
     [
         ("{:06d}", [0, 1, 2], False),
         ("1700000000.{}", [1_700_000_000_000_000_000 + k * 10**8 for k in range(3)], True),
+        ("1700000000_{}00000000", [1_700_000_000_000_000_000 + k * 10**8 for k in range(3)], True),
+        ("frame_{}", [0, 1, 2], False),
     ],
 )
 def test_groups_may_be_numbered_or_called_by_seconds(tmp_path, name, stamps, has_times):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import weakref
 from functools import cached_property, partial
 from pathlib import Path
@@ -60,7 +61,8 @@ class HDF5Log(Log):
 
     Attributes:
         timestamps: nanoseconds, ascending. Names of groups (`sweep_name`) may be nanoseconds, microseconds, seconds
-            with decimals, or numbers 000000, 000001, ... Sweeps with numbers have no `timestamp_ns`.
+            with decimals (1700000000.05, 1700000000_050000000), dates, or numbers (000000, frame_0). Sweeps with
+            numbers have no `timestamp_ns`.
         ego_T_lidar: (4, 4) float64, the transform in use.
 
     Convention:
@@ -271,13 +273,23 @@ scene_errors = partial(file_errors, hint="copy or write the scene again")
 
 
 def sweep_names(scene: Any) -> dict[int, str]:
-    """Return the time stamp of each sweep of an open scene, nanoseconds, and the name of its group."""
+    """Return the time stamp of each sweep of an open scene, nanoseconds, or its number, and the name of its group.
+
+    Names are numbers. Otherwise they are those that are alike apart from their digits, and state times or numbers.
+    """
     names = {int(name): name for name in scene if is_timestamp(name)}
     if _FIRST_MICROSECOND <= max(names, default=0) < _FIRST_NANOSECOND:
         names = {1000 * stamp: name for stamp, name in names.items()}
-    decimals = [name for name in scene if "." in name]
-    stamps = None if names else times_of_names(decimals)
-    return names if stamps is None else dict(zip(stamps, decimals))
+    if names:
+        return names
+    forms: dict[str, list[str]] = {}
+    for name in scene:
+        if re.search("[0-9]", name):
+            forms.setdefault(re.sub("[0-9]+", "0", name), []).append(name)
+    alike = max(forms.values(), key=len, default=[])
+    numbers = [re.findall("[0-9]+", name) for name in alike]
+    stamps = times_of_names(alike) or [int(each[0]) for each in numbers if len(each) == 1 and len(each[0]) < 19]
+    return dict(zip(stamps, alike)) if len({*stamps}) == len(alike) else {}
 
 
 def import_h5py() -> Any:
