@@ -58,6 +58,7 @@ class Log(ABC):
         is_compensated: True = the format is known to be compensated for ego motion within a sweep.
         has_raw_times: True = sweeps with `point_times` are expected not to be compensated.
         has_sparse_poses: True = most poses are interpolated between sweeps.
+        has_estimated_poses: True = we estimated the poses from the points (`cflow_torch.data.odometry`).
         lidar_position: (3,) metres, position of the rotating LiDAR in the frame of the points.
         has_viewpoints: True = the poses come with the clouds, which are then often in the world's frame.
         turn_seconds: duration of a turn of the LiDAR; None = the median time between two sweeps.
@@ -75,6 +76,7 @@ class Log(ABC):
     gaps: frozenset[int] = frozenset()
     has_viewpoints: bool = False
     has_sparse_poses: bool = False
+    has_estimated_poses: bool = False
     # What `cflow_torch.data.deskewing` must know of a reader.
     is_compensated: bool = False
     has_raw_times: bool = False
@@ -436,7 +438,7 @@ class _OfLog:
 for _name in (
     *("labels", "columns", "cameras", "poses", "trajectory", "readings", "judgement", "findings"),
     *("eval_mask", "stored_motion", "moving", "units", "boxes", "T_camera0_lidar", "sample_tokens"),
-    *("sweep_name", "frame_number", "sweep_times"),
+    *("sweep_name", "frame_number", "sweep_times", "has_estimated_poses"),
     *("notes", "_note", "close", "unwrapped"),
 ):
     setattr(LogWrapper, _name, _OfLog(_name))  # `__getattr__` is not asked for members that `Log` has

@@ -211,6 +211,10 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     if not judgement.best:
         text = f"{judgement.given:.2f} of the static structure is in place some sweeps later"
         return [Finding("ego motion", RIGHT, text + ("" if has_poses else ", without poses"), True)]
+    if log.has_estimated_poses:
+        shares = f"{judgement.given:.2f} of the static structure is in place, {judgement.fits:.2f} under another motion"
+        text = f"the poses that we estimated from the points do not fit well ({shares}): give measured poses, if any"
+        return [Finding("ego motion", WRONG, text, True)]
     name = judgement.best[0]
     if name == UNKNOWN:
         why = "there are no poses, but" if not has_poses else "the poses hardly move, but"
