@@ -404,6 +404,16 @@ def test_a_lidar_that_is_turned_and_elsewhere_is_located(turning):
     assert found and np.hypot(float(found[1]) - 2, float(found[2])) < 0.5
 
 
+def test_a_rotation_and_a_place_that_fit_only_together_are_one_matrix(real):
+    """The rotation alone would be 27 degrees, under which some sweeps do not fit."""
+    ego_T_lidar = as_matrix(rotations_about(2, np.radians(30)), (1, 0.2, 0))
+    mixed = Wrong(real, points=lambda points, _: transform_points(points, np.linalg.inv(ego_T_lidar)), masks=False)
+    problem = next(text for text in find_problems(mixed) if "ego_T_lidar" in text)
+    matrix = np.array(json.loads(re.search(r"data.ego_T_lidar=(\[\[\S*\]\])", problem)[1]))
+    assert np.degrees(turn_of(matrix[:3, :3].T @ ego_T_lidar[:3, :3])) < 1.5
+    assert np.hypot(*(matrix - ego_T_lidar)[:2, 3]) < 0.4
+
+
 @pytest.mark.parametrize(
     ("source", "degrees"),
     [
