@@ -10,10 +10,12 @@ import numpy as np
 from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.errors import warn
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError
 
 _LISTED = 20  # names in a message
+_NO_CATEGORY = "NONE"
 # Metres added to length, width and height of the boxes of t, because annotated boxes are a little too tight.
 _MARGIN = (0.2, 0.2, 0.0)
 
@@ -48,14 +50,17 @@ class Boxes:
 
 
 def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> list[int]:
-    """Return the index of the Argoverse 2 category of each of K boxes.
+    """Return the index of the Argoverse 2 category of each of K boxes; 0 = none. We say which are unknown.
 
     `names` are the categories of the boxes in their own data set. `known` maps these to categories of Argoverse 2.
     """
-    unknown = sorted(set(names) - set(known))
+    unknown = sorted(set(names) - set(known), key=str)
     if unknown:
-        raise CFlowError(f"the categories {shortened(unknown[:_LISTED])} are unknown; known are {list(known)}")
-    return [CATEGORY_INDEX[known[name]] for name in names]
+        warn(
+            f"we do not know the categories {shortened(unknown[:_LISTED])} of boxes, so labels have the flow of these "
+            "boxes, but no category"
+        )
+    return [CATEGORY_INDEX[known.get(name, _NO_CATEGORY)] for name in names]
 
 
 def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from typing import Any, Iterator, Mapping, NamedTuple, Sequence, overload
 from cflow_torch.data.deskewing import DeskewedLog, check_deskew
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.finding import FOUND, Finding
-from cflow_torch.data.folders import distinct_names, find_folders, visible
+from cflow_torch.data.folders import distinct_names, find_folders, length_of_chain, visible
 from cflow_torch.data.log import CachedLog, Log, LogWrapper, add_gaps_in_time
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
@@ -101,7 +101,7 @@ def recognise(root: Any) -> str:
         if not top.exists():
             raise CFlowError(f"{root}: there is no such file or folder")
         level, found, marked = [top], [], [top]
-        for _ in range(_DEEPEST):
+        for _ in range(_DEEPEST + length_of_chain(top)):
             marks = [
                 (name, path) for name, one in DATA_SETS.items() for path in level if any(map(path.match, one.marks))
             ]
@@ -178,7 +178,9 @@ _CONVERSIONS = {
     **dict.fromkeys(
         (".xyz", ".txt", ".asc", ".pts", ".csv"), "clouds have lines of three numbers or more, x, y, z first"
     ),
-    **dict.fromkeys((".pcap", ".pcapng"), "convert the packets with the tool of the sensor's maker to .pcd or a bag"),
+    **dict.fromkeys(
+        (".pcap", ".pcapng", ".osf"), "convert the packets with the tool of the sensor's maker to .pcd or a bag"
+    ),
     **dict.fromkeys((".e57", ".drc", ".rcp"), "convert them to .ply"),
     ".zstd": "unpack them (zstd -d); they are bags of ros2 bag record --compression-mode file",
     **dict.fromkeys((".gz", ".zip", ".tar", ".tgz", ".7z", ".zst", ".bz2"), "unpack them"),
@@ -194,12 +196,16 @@ def _why_nothing_fits(top: Path) -> str:
     from cflow_torch.data.arrays.cloud_text import SUFFIXES as TEXTS
 
     level, suffixes = [top], Counter()  # type: ignore[var-annotated]
-    for _ in range(_DEEPEST):
+    depth = _DEEPEST + length_of_chain(top)
+    for _ in range(depth):
         suffixes.update(suffix_of(path) or path.suffix for path in level if path.is_file())
         level = [path for folder in level for path in visible(folder)]
     if not suffixes:
-        return "it has no files that you may read" if top.is_dir() else ""
-    suffix, count = suffixes.most_common(1)[0]
+        return f"it has no files that you may read, down to {depth - 1} folders below" if top.is_dir() else ""
+    # Files next to clouds may be more: .json beside .pcap, .txt beside .las.
+    known = [kind for kind, _ in suffixes.most_common() if kind in (*_CONVERSIONS, *SUFFIXES)]
+    suffix = min(known, key=lambda kind: kind in TEXTS, default="")
+    count = suffixes[suffix]
     clouds = [kind for kind in suffixes if kind in SUFFIXES] or [kind for kind in suffixes if kind in TEXTS]
     clouds = [] if suffix in _CONVERSIONS and suffix not in TEXTS else clouds
     if clouds and all(suffixes[kind] == 1 for kind in clouds):

@@ -7,6 +7,9 @@ from typing import Iterable, Sequence
 
 import numpy as np
 
+from cflow_torch.data.file_errors import shortened
+from cflow_torch.errors import CFlowError
+
 AXES = ("x", "y", "z")
 # Names without punctuation and units, as drivers, odometry programs and exports of ROS messages write them.
 _ROTATION = "(q|.*quat|.*quaternion|.*orientation|.*rot|.*rotation|.*heading|qrs)"
@@ -26,6 +29,7 @@ _ROLES = {
     "pitch": ".*pitch(deg|degrees|rad|radians)?",
     "yaw": ".*(yaw|heading|theta)(deg|degrees|rad|radians)?",
 }
+_ROTATIONS = (("qx", "qy", "qz"), ("q0", "q1", "q2", "q3"), ("roll", "pitch", "yaw"))
 _TIME_OF_POINT = "((d|delta)?t|.*time|.*stamp|(t|.*time|.*stamp)?offset)(s|secs?|nsecs?|ns|us|ms|unix)?"
 _FEWEST_COUNTED = 20  # rows of a column that surely counts them
 _OTHERS = "normal|twist|linear|angular|veloc|accel|covariance|rate"
@@ -73,6 +77,17 @@ def role_of_name(name: str) -> str | None:
     if re.search(_OTHERS, plain):
         return None
     return next((role for role, pattern in _ROLES.items() if re.fullmatch(pattern, plain)), None)
+
+
+def are_of_poses(names: Iterable[str]) -> bool:
+    """Test whether columns hold rotations, as those of poses or boxes do: a quaternion, or three angles."""
+    roles = {role_of_name(name) for name in names}
+    return any(set(rotation) <= roles for rotation in _ROTATIONS)
+
+
+def check_no_poses(names: Sequence[str]) -> None:
+    if are_of_poses(names):
+        raise CFlowError(f"its columns {shortened(list(names))} are those of poses or boxes, not of points")
 
 
 def time_columns(names: Iterable[str]) -> list[str]:

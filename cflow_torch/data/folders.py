@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from itertools import islice
 from pathlib import Path
 from typing import Any, Callable, Sequence, TypeVar
 
@@ -13,6 +14,7 @@ from cflow_torch.errors import CFlowError
 _T = TypeVar("_T")
 _OF_FLOW, _OF_CLEAN = "manifest.json", "clean.json"  # records in folders of results; the second are logs, too
 _OURS = b'"cflow_torch"'  # what a record of ours contains
+_LONGEST_CHAIN = 16  # folders, each alone in the one before; links may make it endless
 
 
 def search(
@@ -25,13 +27,15 @@ def search(
     """Collect what `find` returns for `root` and the folders at most `depth` levels below it, by levels.
 
     We do not search below folders in which something is found, in hidden folders, in folders of flow that we computed,
-    or in folders for which `is_passed` is False. Clean logs that we wrote count only if there are no others. A root
-    that is not a folder is a `CFlowError`, which says `what` to pass.
+    or in folders for which `is_passed` is False. Clean logs that we wrote count only if there are no others. A chain of
+    folders below the root, each alone, costs no depth. A root that is not a folder is a `CFlowError`, which says `what`
+    to pass.
     """
     if not root.is_dir():
         raise CFlowError(f"{root} is not a folder; pass {what}")
     found: list[_T] = []
     clean: list[_T] = []
+    depth = depth + length_of_chain(root)
     level = [root]
     for _ in range(depth + 1):
         children: list[Path] = []
@@ -71,6 +75,17 @@ def visible(folder: Path) -> list[Path]:
         if is_remote(folder):  # there are no credentials
             raise
         return []
+
+
+def length_of_chain(root: Path) -> int:
+    """Return how many folders follow below a folder, each the only one in that before."""
+    folder = root
+    for length in range(_LONGEST_CHAIN):
+        below = list(islice((path for path in visible(folder) if path.is_dir()), 2))
+        if len(below) != 1:
+            return length
+        folder = below[0]
+    return _LONGEST_CHAIN
 
 
 def natural_key(name: str) -> tuple[Any, ...]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any, Callable, Iterable, List
+from typing import Any, Callable, Iterable, Iterator, List
 
 import numpy as np
 
@@ -15,12 +17,12 @@ from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
 from cflow_torch.diagnosis.inspection import mask_problem, repeats
 from cflow_torch.diagnosis.pair import difference
-from cflow_torch.diagnosis.point_frame import frame_problem
+from cflow_torch.diagnosis.point_frame import frame_problem, tilt_problem
 from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, Judgement
 from cflow_torch.diagnosis.stillness import IN_PLACE, LEAST_SHARE, Structure, are_finite, share_of_sweeps
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.transforms import relative_transform, transform_points
-from cflow_torch.types import Sweep, as_numpy
+from cflow_torch.types import Array, Sweep, as_numpy
 
 _CACHED = 12  # sweeps that several checks read
 _STRIP = 4.0  # metres, half width of the strip whose points are looked for in the next sweep
@@ -33,6 +35,7 @@ _UNEVEN = 0.1  # change of the intervals of times from one to the next
 _EVEN = 0.5  # change of the motion over that of the intervals
 _MOST_SEEN = 20_000  # points that show in which directions a sweep measures, and whether they lie on a grid
 _DIRECTIONS = 36  # of a turn, and from straight down to straight up
+_NUM_SPREAD = 5  # sweeps that tell whether the sensor is tilted
 _LEAST_SHARED = 0.6  # share of the points in directions in which neighbouring sweeps both measure
 _FEWEST_SEEN = 300  # points that show in which directions a sweep measures
 _TOPICS = (
@@ -57,6 +60,7 @@ _TWO_SENSORS = Finding(
     True,
 )
 _OF_SPARSE_POSES = "its poses are interpolated over several sweeps, which data.odometry=refine corrects"
+_OTHER_GROUND = "choose another method (data.find_ground=grid, patchwork or null), or give masks"
 _UNITS_OF_POINTS = [f"points_{unit}" for unit in UNITS]
 
 
@@ -68,12 +72,29 @@ class _CheckedLog(CachedLog):
         return typical_sweeps(self)
 
     @cached_property
+    def is_empty(self) -> bool:
+        """Whether no typical sweep has a finite point."""
+        return not any(are_finite(as_numpy(self.sweep(index).points)).any() for index in self.typical)
+
+    @cached_property
     def frame(self) -> tuple[str, str]:
         """The reading that corrects the points, and what is wrong with them; both "" if nothing is."""
         reading, problem = frame_problem(self.sweep(self.typical[0]).points)
         if not problem and begins_late(self):
             problem = "the first column does not seem to be x: give x, y, z first, and then others such as intensity"
         return reading, problem
+
+    @cached_property
+    def tilt(self) -> str:
+        """By how much the sensor is tilted, if nothing else is wrong with the points; "" = it is not."""
+        return "" if self.frame[1] else tilt_problem(self._spread())
+
+    def _spread(self) -> Iterator[Array]:
+        """Yield the points of a typical sweep, then of others spread over the log that can be read."""
+        others = np.linspace(0, len(self) - 1, _NUM_SPREAD).round().astype(int).tolist()
+        for index in dict.fromkeys([self.typical[0], *others]):
+            with suppress(CFlowError, OSError):
+                yield self.sweep(index).points
 
     @cached_property
     def motion(self) -> Judgement:
@@ -108,7 +129,7 @@ def find_problems(log: Log) -> list[str]:
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """
-    findings = _collect(_CheckedLog(log, _CACHED), (_found, _frame, _mask, _repeated, _lapses))
+    findings = _collect(_CheckedLog(log, _CACHED), (_found, _empty, _frame, _mask, _repeated, _lapses))
     return [finding.text for finding in findings if finding.status != RIGHT and finding.is_quick]
 
 
@@ -120,6 +141,7 @@ def examine(log: Log) -> list[Finding]:
     checks = (
         _sensor,
         _found,
+        _empty,
         _frame,
         _times,
         _poses,
@@ -153,11 +175,20 @@ def _found(log: Log) -> list[Finding]:
     return log.findings()
 
 
+def _empty(log: _CheckedLog) -> list[Finding]:
+    if not log.is_empty:
+        return []
+    names = ", ".join(map(_name_of, log.typical))
+    return [Finding("sweeps", WRONG, f"no point is finite in {names}: are the files complete?", True)]
+
+
 def _frame(log: _CheckedLog) -> list[Finding]:
     """Check a typical sweep; without poses also the last one, which is far away if points are in the world's frame.
 
     Then check the ego motion in the frame that the points will have.
     """
+    if log.is_empty:
+        return []
     reading, problem = log.frame
     checked = log.typical[0]
     is_last = not problem and known_poses(log) is None
@@ -166,7 +197,12 @@ def _frame(log: _CheckedLog) -> list[Finding]:
         _, problem = frame_problem(log.sweep(checked).points)
     if not problem:
         right = Finding("frame", RIGHT, "metres, around the vehicle, z up", True)
-        return [right, *_motion(log, "")]
+        if not log.tilt:
+            return [right, *_motion(log, "")]
+        # Under a tilt, poses of the vehicle may fit under no reading.
+        has_misfit = log.motion.is_low or NO_READING in log.motion.best
+        is_explained = has_misfit and known_poses(log) is not None
+        return [Finding("frame", WRONG, log.tilt, True), *([] if is_explained else _motion(log, ""))]
     # The unit under which the points fit the poses may be another one.
     is_unit = reading in _UNITS_OF_POINTS and known_poses(log) is not None
     unit, _ = _fitting(log, [reading, *_UNITS_OF_POINTS]) if is_unit else ("", 0)
@@ -174,8 +210,9 @@ def _frame(log: _CheckedLog) -> list[Finding]:
         reading, problem = unit, f"{READINGS[unit].cause}, because the motion then fits that of the poses"
     fix = f"; {_setting(log, reading)} converts them" if reading else ""
     wrong = Finding("frame", WRONG, f"in {_name_of(checked)} {problem}{fix}", True)
-    # In another frame that we do not know, readings of the poses mean nothing.
-    return [wrong, *(_motion(log, reading) if reading or is_last else [])]
+    # In another frame that we do not know, readings of the poses mean nothing, and sweeps need not fit.
+    is_judged = reading or (is_last and not log.motion.is_low)
+    return [wrong, *(_motion(log, reading) if is_judged else [])]
 
 
 def _fitting(log: Log, readings: Iterable[str]) -> tuple[str, float]:
@@ -197,8 +234,9 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     # The poses are judged in the frame that the points will have.
     log: Log = ReadAs(checked, reading) if reading else checked
     judgement = judge_log(log) if reading else checked.motion
-    if not judgement.shares:
+    if not judgement.shares or (judgement.is_low and judgement.is_sparse):
         return [Finding("ego motion", RIGHT, "not compared, because the sweeps have too little static structure", True)]
+    judgement = replace(judgement, best=(NO_READING,)) if judgement.is_low else judgement
     has_poses = log.sweep(0).pose is not None
     if has_poses and judgement.best and checked.misfit:
         return checked.misfit
@@ -212,8 +250,8 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
         text = f"{judgement.given:.2f} of the static structure is in place some sweeps later"
         return [Finding("ego motion", RIGHT, text + ("" if has_poses else ", without poses"), True)]
     if log.has_estimated_poses:
-        shares = f"{judgement.given:.2f} of the static structure is in place, {judgement.fits:.2f} under another motion"
-        text = f"the poses that we estimated from the points do not fit well ({shares}): give measured poses, if any"
+        share = f"only {judgement.given:.2f} of the static structure is in place"
+        text = f"the poses that we estimated from the points do not fit well ({share}): give measured poses, if any"
         return [Finding("ego motion", WRONG, text, True)]
     name = judgement.best[0]
     if name == UNKNOWN:
@@ -224,12 +262,12 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     elif name == NO_READING:
         why, fix = "", "check that the points are x, y, z in metres, and "
         of_poses = "that the poses belong to this log and are of the points' frame (else give data.ego_T_lidar), "
-        fix += f"{of_poses}their times, units and quaternions" if has_poses else "pass poses"
+        fix += f"{of_poses}their times, units and quaternions" if has_poses else "pass poses or data.odometry=true"
         fix += "" if has_poses else ", unless the files are no successive sweeps of one drive, which have no flow"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
         fix = " or ".join(judgement.reading(each).fix or _setting(log, each) for each in judgement.best)
-        fix = f"give {fix}" + (", or pass no poses" if name == STILL else "")
+        fix = f"give {fix}" + (", or no poses (data.poses=null)" if name == STILL else "")
         if name in TIMES_OF_POSES and log.trajectory is not None:
             why += " the clocks of sweeps and poses may differ, because"
     return [Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)]
@@ -262,10 +300,15 @@ def _mask(log: _CheckedLog) -> list[Finding]:
     if not known:
         return [Finding("ground", RIGHT, "no masks, so no point is taken for ground (data.find_ground=grid finds it)")]
     for index in known:
-        problem = "" if log.frame[1] else mask_problem(log.sweep(index))
+        problem = "" if log.frame[1] or log.tilt else mask_problem(log.sweep(index))
         if problem:
-            return [Finding("ground", WRONG, f"the mask of {_name_of(index)} is {problem}", True)]
-    mask: Any = masks[known[0]]
+            text = f"the mask of {_name_of(index)} is {problem}"
+            if log.unwrapped.sweep(index).is_ground is None:  # we made it
+                mask: Any = masks[index]
+                what = "other points than those of the ground" if as_numpy(mask).any() else "no ground"
+                text = f"we find {what} in {_name_of(index)}, which has some: {_OTHER_GROUND}"
+            return [Finding("ground", WRONG, text, True)]
+    mask = masks[known[0]]
     share = float(as_numpy(mask).mean()) if len(mask) else 0.0
     return [Finding("ground", RIGHT, f"{100 * share:.0f} % of the points of {_name_of(known[0])}", True)]
 

@@ -135,17 +135,18 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
         if WORLD in judgement.best:
             return judgement
     judgement = judge(make_pairs(chosen, scans, False))
-    if judgement.best and poses is not None:  # are only a few sweeps wrong?
+    hardly_moves = poses is not None and _hardly_move(poses)
+    if poses is not None and _does_not_fit(judgement, hardly_moves):  # are only a few sweeps wrong?
         pairs = _pairs_without_repeats(log, poses, jumps, ()) or chosen  # all may repeat the one before
         judgement = judgement if pairs == chosen else judge(make_pairs(pairs, scans, False))
-        if judgement.best:
+        if _does_not_fit(judgement, hardly_moves):
             others = _pairs_without_repeats(log, poses, jumps, {index for pair in pairs for index in pair})
             prepared = [pair for pair in make_pairs(others, scans, False) if pair is not None]
             if _fit_as_given(prepared, judgement):
                 again = judge(prepared)
                 judgement = again if _contradicts(again, judgement) else judgement
     is_unclear = not judgement.best and judgement.given < _UNCLEAR
-    if poses is not None and is_unclear and _hardly_move(poses):
+    if is_unclear and hardly_moves:
         spread = choose_pairs(len(log.timestamps), None)
         clouds = [[replace(log.sweep(index), pose=None) for index in pair] for pair in spread]
         unposed = judge(make_pair(pc0, pc1) for pc0, pc1 in clouds)
@@ -153,6 +154,11 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     if STILL in judgement.best and log.unwrapped.has_viewpoints:
         return replace(judgement, shares={**judgement.shares, WORLD: judgement.shares[STILL]}, best=(WORLD,))
     return judgement
+
+
+def _does_not_fit(judgement: Judgement, hardly_moves: bool) -> bool:
+    """Test whether another reading is better or, if the poses move, little of the structure is in place."""
+    return bool(judgement.best) or (judgement.is_low and not hardly_moves)
 
 
 def _hardly_move(poses: np.ndarray) -> bool:
@@ -205,12 +211,12 @@ def _least_share(judgement: Judgement) -> float:
 
 
 def _contradicts(again: Judgement, judgement: Judgement) -> bool:
-    """Test whether other sweeps fit clearly better as given, and show that the best reading is wrong.
+    """Test whether other sweeps fit clearly better as given, and show that the best reading, if any, is wrong.
 
     Then only a few sweeps are wrong, such as one that repeats the one before. Errors of measurement differ by sweep.
     """
-    shown = again.shares.get(judgement.best[0], float("nan")) if judgement.best else float("nan")
-    return not again.best and shown <= again.given and again.given >= _least_share(judgement)
+    is_worse = not judgement.best or again.shares.get(judgement.best[0], float("nan")) <= again.given
+    return not again.best and is_worse and again.given >= _least_share(judgement)
 
 
 def _make_pairs(

@@ -65,8 +65,9 @@ class Neighbours(NamedTuple):
 
     @property
     def small(self) -> dict[int, int]:
-        """The sweeps with few points, and how many those around each have."""
-        counts = np.array(list(self.num_points.values()))
+        """The sweeps with few points, and how many those around each have, apart from those without any."""
+        numbers = np.array(list(self.num_points.values()))
+        counts = np.where(numbers > 0, numbers, np.nan)
         around = [int(_median(counts[max(k - _AROUND, 0) : k + _AROUND + 1])) for k in range(len(counts))]
         known = zip(self.num_points.items(), around)
         return {index: usual for (index, number), usual in known if number < _FEW * usual}

@@ -122,7 +122,8 @@ def _describe_misfit(source: str, known: np.ndarray, wanted: np.ndarray) -> str:
         lag = wanted[len(wanted) // 2] - known[len(known) // 2]
         return (
             f"{source} covers {known[0]} ... {known[-1]} ns, and {where}: the clocks differ by about "
-            f"{lag * 1e-9:.6g} s. Both must count from the same time; shift the times of one, or pass no poses"
+            f"{lag * 1e-9:.6g} s. Both must count from the same time; shift the times of one, or give no poses "
+            "(data.poses=null)"
         )
     rate = np.median(np.diff(known)) * 1e-9
     fix = "give more poses, or none and data.odometry=true"

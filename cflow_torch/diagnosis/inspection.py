@@ -10,7 +10,7 @@ import torch
 from cflow_torch.config import Config
 from cflow_torch.diagnosis.conventions import INVERTED, STILL, WORLD
 from cflow_torch.diagnosis.pair import make_pair
-from cflow_torch.diagnosis.point_frame import frame_problem
+from cflow_torch.diagnosis.point_frame import frame_problem, tilt_problem
 from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, judge
 from cflow_torch.diagnosis.stillness import LEAST_SHARE, MISPLACED, are_finite, share_of_sweeps
 from cflow_torch.errors import warn
@@ -72,7 +72,7 @@ class Inspection:
         first = windows[0]
         if not self._has_seen_points:
             self._has_seen_points = True
-            _, problem = frame_problem(first.pc0.points)
+            problem = frame_problem(first.pc0.points)[1] or tilt_problem([first.pc0.points])
             if problem:
                 self._has_seen_structure = True  # in another frame, readings of the poses mean nothing
             elif first.pc0.is_ground is None:
@@ -101,12 +101,14 @@ def mask_problem(sweep: Sweep) -> str:
     points = as_numpy(sweep.points)[rows, :3]
     given: Any = sweep.is_ground
     mask = as_numpy(given)[rows]
-    if len(mask) and mask.all():
+    is_known = are_finite(points)
+    if not is_known.any():
+        return ""
+    if mask.all():
         return "that of all points, so no point would have flow: give masks of the ground alone, or none"
     found = as_numpy(find_ground(points))
     if not mask.any():
         return f"empty, but the sweep {_GROUND}; is_ground=None is 'unknown'" if found.any() else ""
-    is_known = are_finite(points)
     both = np.stack([found, mask])[:, is_known].astype(np.float64)
     fit = float(np.corrcoef(both)[0, 1]) if (np.ptp(both, axis=1) > 0).all() else 1.0
     if fit > _MISFIT or found[mask & is_known].mean() > _MOST_OF_MASK:  # the mask may be that of the road alone

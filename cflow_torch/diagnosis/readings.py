@@ -69,6 +69,7 @@ class Judgement:
     found: Mapping[str, Reading] = field(default_factory=dict)  # readings that follow from these points
     scan: str = ""  # the scan under which this holds; "" = not compared
     shares_of_scans: Mapping[str, float] = field(default_factory=dict)
+    is_sparse: bool = False  # the sweeps have so few points that hardly any is measured again
 
     @property
     def given(self) -> float:
@@ -79,6 +80,11 @@ class Judgement:
     def fits(self) -> float:
         """Share of structure in place under the best reading."""
         return self.shares.get(self.best[0], self.given) if self.best else self.given
+
+    @property
+    def is_low(self) -> bool:
+        """Whether less of the structure is in place as given than in sweeps that fit, and no reading is better."""
+        return not self.best and self.given < LEAST_SHARE
 
     def reading(self, name: str) -> Reading:
         """Return what a reading means."""
@@ -102,6 +108,10 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
     motion. Cost: 0.1 s per pair.
     """
     usable = [pair for pair in pairs if pair is not None]
+    return replace(_judge(usable), is_sparse=any(pair.is_sparse for pair in usable))
+
+
+def _judge(usable: Sequence[Pair]) -> Judgement:
     moving = [pair for pair in usable if pair.has_motion]
     if not moving:
         shares, clear = _compare([pair.among(STEPS).shares_of_poses(OFF) for pair in usable])

@@ -92,13 +92,13 @@ def _are_in_tall_columns(points: np.ndarray) -> np.ndarray:
     return result
 
 
-def thinned_rows(points: np.ndarray) -> np.ndarray:
-    """Return a row of each voxel of 0.3 m, (K,) int64, ascending. `points` are (N, 3), finite, metres.
+def thinned_rows(points: np.ndarray, side: float = VOXEL) -> np.ndarray:
+    """Return a row of each voxel of `side` metres, (K,) int64, ascending. `points` are (N, 3), finite, metres.
 
     The choice is random with a fixed seed. The first row would lie at an edge of its voxel, as scans are ordered, and
     two scans of a smooth wall would then match best if they are moved by whole voxels.
     """
-    voxel = np.floor(np.asarray(points, np.float64) / VOXEL).astype(np.int64)
+    voxel = np.floor(np.asarray(points, np.float64) / side).astype(np.int64)
     order = np.random.default_rng(0).permutation(len(voxel))
     _, first = np.unique(cell_keys(voxel)[order], return_index=True)
     return np.sort(order[first])

@@ -255,6 +255,16 @@ class Columns:
         beside = self.image.index_select(0, cell.view(-1)).view_as(cell)  # [(2 reach + 1)^2, K]
         return self.pixel_at(self.entry(pixels.step, beside).view(-1), count)
 
+    def pixel_in(self, window: Tensor, step: int, row_col: Tensor, count: int) -> Groups:
+        """Return which of the `count` pixels of the list are in cells of a sweep.
+
+        `window` is (K,) int64, and `row_col`, (2, M, K) int64, may be outside of the images. The result has M K items.
+        """
+        row = row_col[0].clamp(-1, self.grid.height)
+        col = row_col[1].clamp(-1, self.grid.width)
+        column = self.image.index_select(0, self.lattice.cell(window, row, col).view(-1))
+        return self.pixel_at(self.entry(step, column), count)
+
     def entry(self, step: Tensor | int, column: Tensor) -> Tensor:
         """Return the entries of `rank` of sweeps in columns, in the shape and dtype of both together."""
         return column + step * len(self.cell)

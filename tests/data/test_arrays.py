@@ -318,11 +318,11 @@ def test_organised_arrays_have_a_row_per_point(tmp_path):
 def test_clouds_of_two_sensors_in_one_folder_need_a_choice(tmp_path):
     for k, name in enumerate(("front_0", "front_1", "rear_0", "rear_1")):
         np.save(tmp_path / f"{name}.npy", np.full((3, 3), k + 1.0))
-    with pytest.raises(CFlowError, match=r"front_\*\.npy, rear_\*\.npy: choose one by suffix"):
+    with pytest.raises(CFlowError, match=r"rear_\*\.npy: choose one, such as data\.suffix='front_\*\.npy'"):
         ArraysLog(tmp_path)
     assert [sweep.points[0, 0] for sweep in ArraysLog(tmp_path, suffix="rear_*.npy")] == [3, 4]
     np.save(tmp_path / "front_2.npy", np.full((3, 3), 9.0))
-    with pytest.raises(CFlowError, match=r"front_\*\.npy, rear_\*\.npy: choose one by suffix"):
+    with pytest.raises(CFlowError, match=r"rear_\*\.npy: choose one, such as data\.suffix='front_\*\.npy'"):
         ArraysLog(tmp_path)
 
 
@@ -360,6 +360,7 @@ def test_numbers_that_count_tell_no_sensors(tmp_path):
 
 def test_files_with_other_contents_are_refused(tmp_path):
     np.save(tmp_path / "flat.npy", np.zeros(9))
+    np.save(tmp_path / "depth.npy", np.ones((64, 900)))
     np.save(tmp_path / "pickle.npy", np.array([{}, 1], dtype=object), allow_pickle=True)
     np.savez(tmp_path / "two.npz", a=np.zeros((3, 3)), b=np.zeros((3, 3)))
     np.savez(tmp_path / "ragged.npz", x=np.zeros(3), y=np.zeros(2), z=np.zeros(3))
@@ -374,9 +375,11 @@ def test_files_with_other_contents_are_refused(tmp_path):
 
 @pytest.mark.parametrize("order", "<>")
 def test_ply_reads_every_number_type(tmp_path, order):
-    names = ("char", "uint8", "int16", "ushort", "int", "uint", "float32", "float64")  # PDAL, Open3D, CloudCompare
-    kinds = [(f"p{code}", order + code) for code in ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")]
-    rows = np.frombuffer(np.random.default_rng(0).bytes(9 * 26), kinds)
+    # PDAL, Open3D, CloudCompare, pyntcloud
+    names = ("char", "uint8", "int16", "ushort", "int", "uint", "float32", "float64", "bool")
+    codes = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8", "u1")
+    kinds = [(f"p{k}", order + code) for k, code in enumerate(codes)]
+    rows = np.frombuffer(np.random.default_rng(0).bytes(9 * 27), kinds)
     properties = "".join(f"property {name} {kind[0]}\n" for name, kind in zip(names, kinds))
     word = "little" if order == "<" else "big"
     header = f"ply\nformat binary_{word}_endian 1.0\nelement vertex 9\n{properties}element face 1\nend_header\n"
@@ -565,7 +568,7 @@ def test_a_sweep_whose_mask_does_not_fit_is_refused(folder):
         with pytest.raises(CFlowError, match=r"000001\.npy"):
             log.sweep(1)
     (folder / "ground" / "000001.npy").unlink()
-    with pytest.raises(CFlowError, match="ground=None"):
+    with pytest.raises(CFlowError, match="data.ground=null"):
         log.sweep(1)
     assert ArraysLog(folder, ground=None).sweep(1).is_ground is None
     for index in (-1, 3):

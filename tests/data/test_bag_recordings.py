@@ -393,6 +393,13 @@ def test_a_message_that_arrives_after_the_next_one_keeps_its_time(tmp_path, swee
     assert list(log.timestamps) == list(late.stamps) and world(log, late.recording) < 5e-3
 
 
+def test_a_bag_without_clouds_says_what_it_has(tmp_path) -> None:
+    bag = Recorder(tmp_path)
+    bag.drive()
+    with pytest.raises(CFlowError, match="it has no topic of type sensor_msgs/msg/PointCloud2; it has /tf"):
+        BagLog(bag.close())
+
+
 def test_a_gap_splits_windows(tmp_path) -> None:
     bag = Recorder(tmp_path)
     bag.mount()

@@ -9,13 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from command_line import cflow
+from pyarrow import csv, feather, parquet
 from small_logs import make_small_drive
 from writers import FORMATS
 
 import cflow_torch
 from cflow_torch.data.arrays import write_array_log
+from cflow_torch.data.arrays.cloud_file import read_cloud
 from cflow_torch.data.catalog import GroundSegmentedLog, Logs, find_sources, open_log, recognise, source_name
 from cflow_torch.data.log import Log, window
 from cflow_torch.simulator import Drive
@@ -107,6 +110,12 @@ def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Pat
     assert find_sources(name, tmp_path / "b") == [tmp_path / "b"]
     with pytest.raises(CFlowError, match="nowhere is not a folder"):
         find_sources(name, tmp_path / "nowhere")
+    chain = tmp_path / "c/h/a/i/n"
+    for file in (log, log.replace("1", "2")):
+        (chain / "1/2/3" / file).parent.mkdir(parents=True, exist_ok=True)
+        (chain / "1/2/3" / file).write_bytes(b"")
+    (chain / "other").mkdir()
+    assert find_sources(name, tmp_path / "c") == [chain / "1/2/3"], "folders that are alone cost no depth"
 
 
 @pytest.mark.parametrize(
@@ -123,6 +132,8 @@ def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Pat
         (["1.pcd"], "it has one file of points"),
         (["0/points.ply", "1/points.ply"], "its 2 .ply files lie alone in their folders: put those of a log into one"),
         (["a.pcap"], "its 1 .pcap files are not read"),
+        (["a.pcap", "a.json", "b.json", "poses.txt", "times.txt"], "its 1 .pcap files are not read"),
+        (["a.osf"], "its 1 .osf files are not read"),
     ],
 )
 def test_what_is_not_read_is_said(names: list, message: str, tmp_path: Path) -> None:
@@ -248,3 +259,26 @@ def test_labels_and_boxes_are_no_logs(tmp_path: Path) -> None:
         for number in range(2):
             np.save(tmp_path / place / f"{number}.npy", np.ones((5, 3)))
     assert find_sources("arrays", tmp_path) == [tmp_path / "scans"]
+
+
+@pytest.mark.parametrize("shape", [(64, 900), (5,), (5, 2), (900, 2)])
+def test_images_and_labels_in_arrays_are_no_logs(shape: tuple, tmp_path: Path) -> None:
+    for place, of_place in (("scans", (900, 3)), ("depth", shape)):
+        (tmp_path / place).mkdir()
+        for number in range(2):
+            np.save(tmp_path / place / f"{number}.npy", np.ones(of_place))
+    assert find_sources("arrays", tmp_path) == [tmp_path / "scans"]
+
+
+@pytest.mark.parametrize("suffix", [".feather", ".parquet", ".csv"])
+def test_tables_of_boxes_are_no_clouds(suffix: str, tmp_path: Path) -> None:
+    """Their times repeat, so they are not a trajectory either."""
+    names = ["timestamp_ns", "length_m", "width_m", "height_m", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"]
+    table = pa.table({name: np.full(30, 0.5) for name in names})
+    write = {".feather": feather.write_feather, ".parquet": parquet.write_table, ".csv": csv.write_csv}[suffix]
+    for name in ("objects_1", "objects_2"):
+        write(table, str(tmp_path / (name + suffix)))
+    with pytest.raises(CFlowError, match="poses or boxes"):
+        read_cloud(tmp_path / f"objects_1{suffix}")
+    with pytest.raises(CFlowError, match="no folder of point clouds"):
+        find_sources("arrays", tmp_path)

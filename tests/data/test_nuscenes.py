@@ -17,7 +17,7 @@ from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog, find_nuscenes_scenes
 from cflow_torch.data.nuscenes.tables import Annotations, Tracks
 from cflow_torch.transforms import poses_from_quaternions, to_quaternions, transform_points
-from cflow_torch.types import CFlowError
+from cflow_torch.types import CFlowError, CFlowWarning
 
 VERSION = "v1.0-mini"
 CAR = CATEGORY_INDEX["REGULAR_VEHICLE"]
@@ -149,17 +149,21 @@ def test_scenes_of_a_version_share_their_tables(tiny, tmp_path):
         ("ego_pose", {"translation": [1, 2, float("nan")]}, "ego_pose.json: .* is not a rigid motion"),
         ("sample_annotation", {"size": ["a", 1, 1]}, "cannot read .*tiny"),
         ("sensor", {"modality": "camera"}, "has no LiDAR"),
-        (
-            "category",
-            lambda rows: [{**row, "name": "vehicle.spaceship"} for row in rows],
-            "category.json: the categories .*spaceship.* are unknown",
-        ),
     ],
 )
 def test_inconsistent_tables_are_refused(tiny, table, change, complaint):
     edit(tiny, table, (lambda rows: rows[0].update(change)) if isinstance(change, dict) else change)
     with pytest.raises(CFlowError, match=complaint):
         open_log(tiny)
+
+
+def test_boxes_of_unknown_categories_have_none(tiny):
+    """As those of Lyft Level 5, whose tables have the form of nuScenes'."""
+    known = open_log(tiny).labels(0)
+    edit(tiny, "category", lambda rows: [{**row, "name": "spaceship"} for row in rows])
+    with pytest.warns(CFlowWarning, match="do not know the categories .*spaceship"):
+        labels = open_log(tiny).labels(0)
+    assert known.category.any() and not labels.category.any() and np.array_equal(labels.flow, known.flow)
 
 
 def test_two_scenes_of_one_name_are_an_error(tiny):

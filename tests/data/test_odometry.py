@@ -115,7 +115,7 @@ def test_poses_of_our_own_are_not_blamed_on_the_user(drive):
     wrong[:, :3, 3] *= 0.8
     texts = [find_problems(PosedLog(drive, wrong, are_estimated=each)) for each in (False, True)]
     assert texts[0][0].startswith("the static world moves under the poses")
-    assert texts[1][0].startswith("the poses that we estimated from the points do not fit well (0.")
+    assert texts[1][0].startswith("the poses that we estimated from the points do not fit well (only 0.")
     assert DeskewedLog(PosedLog(drive, wrong, are_estimated=True)).has_estimated_poses
 
 

@@ -93,6 +93,16 @@ def test_a_wall_along_the_road_a_standing_vehicle_and_unknown_poses_stay(hood):
         assert next(one for one in OwnVehicleLog(log).findings() if one.topic == "own vehicle").status == RIGHT
 
 
+def test_most_of_the_returns_are_not_those_of_the_vehicle():
+    """Wrong poses of a sensor in a room: what it sees seems to ride along."""
+    drive = drive_of(16)
+    few, many = (np.random.default_rng(0).uniform(1, 2, (count, 3)) for count in (200, len(drive.sweep(0).points) + 9))
+    assert sum(num_left_out(OwnVehicleLog(Added(lambda index, _: few)))) > 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert sum(num_left_out(OwnVehicleLog(Added(lambda index, _: many)))) == 0
+
+
 def test_points_upside_down_are_not_taken_for_the_vehicle():
     """Then the ground is not found, so its nearest rings seem to ride along."""
     drive = drive_of(16)

@@ -10,6 +10,7 @@ import pytest
 from cflow_torch import CFlowError
 from cflow_torch.data.arrays.cloud_file import read_cloud, read_columns, write_cloud
 from cflow_torch.data.arrays.pcd import pcd_fields, pcd_viewpoint
+from cflow_torch.types import CFlowWarning
 
 DTYPES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 
@@ -46,6 +47,34 @@ def test_every_truncation_is_detected(tmp_path, data):
         file.write_bytes(whole[:size])
         with pytest.raises(CFlowError, match=r"a\.pcd"):
             read_cloud(file)
+
+
+@pytest.mark.parametrize("data", ("ascii", "binary"))
+def test_a_cloud_without_width_and_height_has_the_number_of_its_points(data):
+    rows = np.arange(9, dtype="<f4").reshape(3, 3)
+    body = rows.tobytes() if data == "binary" else b"0 1 2\n3 4 5\n6 7 8\n"
+    header = b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 0\nHEIGHT 0\n"
+    cloud = pcd_fields(header + f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\nDATA {data}\n".encode() + body)
+    assert np.array_equal(np.stack([cloud[axis] for axis in "xyz"], axis=1), rows)
+
+
+def test_fields_of_a_text_that_are_characters_are_left_out_and_said(tmp_path):
+    """PCL writes a byte as a character: also blanks, ends of lines, and NUL."""
+    rows = [
+        b"%d.5 %d -nan(ind) 7.000 %c %c" % (k, 2 * k, tag, k % 3) for k, tag in enumerate((16, 32, 10, 9, 0, 48, 255))
+    ]
+    header = (
+        b"FIELDS x y z intensity tag line\nSIZE 4 4 4 2 1 1\nTYPE F F F U U U\nCOUNT 1 1 1 1 1 1\nWIDTH 7\nHEIGHT 1\n"
+    )
+    (tmp_path / "a.pcd").write_bytes(header + b"POINTS 7\nDATA ascii\n" + b"\n".join(rows))
+    with pytest.warns(CFlowWarning, match="the fields tag, line of .pcd files hold characters"):
+        cloud = pcd_fields((tmp_path / "a.pcd").read_bytes())
+    assert list(cloud) == ["x", "y", "z", "intensity"] and cloud["x"].tolist() == [k + 0.5 for k in range(7)]
+    assert cloud["intensity"].tolist() == [7] * 7 and np.isnan(cloud["z"]).all()
+    for wrong in (rows[:-1], [*rows[:-1], b"a 1 2 3 4 5"]):
+        (tmp_path / "a.pcd").write_bytes(header + b"POINTS 7\nDATA ascii\n" + b"\n".join(wrong))
+        with pytest.raises(CFlowError, match="a.pcd"):
+            read_cloud(tmp_path / "a.pcd")
 
 
 def test_padding_and_vector_fields_are_left_out(tmp_path):

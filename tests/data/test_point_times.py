@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cflow_torch.data.column_names import time_columns
-from cflow_torch.data.point_times import seconds_after
+from cflow_torch.data.point_times import find_times, seconds_after
 
 STAMP = 1_700_000_000_123_456_789
 SHARES = np.linspace(0, 1, 2001)
@@ -71,6 +71,29 @@ def test_stray_values_are_found_and_change_no_other_time(stray: int) -> None:
     assert np.array_equal(times.is_stray, is_wrong)
     assert np.allclose(times.seconds[~is_wrong], SHARES[~is_wrong] * 0.1, atol=1e-6)
     assert np.abs(times.seconds).max() < 0.2, "the model refuses sweeps with other times"
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_a_column_of_which_many_values_are_stray_holds_no_times(share: float) -> None:
+    """Such a column may be read from other bytes: its values have any size."""
+    values = STAMP * 1e-9 + SHARES * 0.1
+    is_wrong = np.random.default_rng(0).random(len(values)) < share
+    values[is_wrong] = np.resize((1e308, -1e308, np.nan, 1e-200, np.inf), is_wrong.sum())
+    values[is_wrong.argmax()] = np.array(0x7FF0000000000001, np.uint64).view(np.float64)  # a signalling NaN
+    times = seconds_after(values, STAMP, 0.1)
+    assert (times.seconds is None) == (share > 0.2)
+    assert "stray: ignored" in times.note if share > 0.2 else np.array_equal(times.is_stray, is_wrong)
+
+
+def test_missing_returns_have_no_stray_times() -> None:
+    values = STAMP * 1e-9 + SHARES * 0.1
+    is_missing = np.arange(len(values)) % 2 == 1
+    values[is_missing] = np.resize((np.nan, 0.0), is_missing.sum())
+    told: list[str] = []
+    times = find_times({"t": values}, STAMP, 0.1, lambda note, kind: told.append(note), is_missing)
+    assert times is not None and not times.is_stray.any() and told == [""]
+    assert times.seconds is not None and np.allclose(times.seconds[~is_missing], 0.1 * SHARES[~is_missing], atol=1e-6)
 
 
 def test_points_of_lost_packets_at_time_zero_are_stray_within_the_sweep() -> None:

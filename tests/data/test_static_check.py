@@ -15,7 +15,7 @@ import pytest
 from cflow_torch import CFlowError, Sweep
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.catalog import open_log
+from cflow_torch.data.catalog import GroundSegmentedLog, open_log
 from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.log import CachedLog, Log, LogWrapper, poses_beyond
 from cflow_torch.data.log_check import FOUND, RIGHT, WRONG, check_log, examine, find_problems
@@ -381,6 +381,26 @@ def test_poses_of_another_log_are_named(drive):
     assert judge_log(mixed).best == (NO_READING,) and "no reading" in find_problems(mixed)[0]
 
 
+@pytest.mark.parametrize("poses", [None, lambda _: None], ids=["poses", "no poses"])
+def test_two_sweeps_that_do_not_fit_are_told(drive, poses):
+    turn = rotations_about(2, 1.9)
+    log = Wrong(
+        drive, lambda points, pose: points if np.array_equal(pose, drive.sweep(0).pose) else points @ turn.T, poses
+    )
+    log.timestamps = log.timestamps[:2]
+    if poses is None:
+        log.poses = log.poses[:2]
+    (text,) = find_problems(log)
+    assert text.startswith("the sweeps fit under no reading (only 0.00 of the static structure is in place)")
+
+
+def test_a_share_below_that_of_sweeps_that_fit_is_told(drive):
+    rng = np.random.default_rng(0)
+    noisy = Wrong(drive, lambda points, _: points + rng.normal(0, 0.08, points.shape))
+    assert 0.04 < judge_log(noisy).given < 0.1 and not judge_log(noisy).best
+    assert "no reading" in find_problems(noisy)[0]
+
+
 @pytest.mark.parametrize(
     ("source", "side"), [pytest.param("drive", 0, marks=pytest.mark.slow), ("real", 0), ("drive", 2)]
 )
@@ -697,16 +717,19 @@ WRONG_POINTS = {
     "radians": (spherical(1.0), "data.read_as=points_spherical"),
     "degrees": (spherical(np.pi / 180), "data.read_as=points_spherical"),
     "elsewhere": (lambda points, _: points + [500, 0, 0], "frame of the LiDAR or of the vehicle"),
-    "pitch": (lambda points, _: points @ rotations_about(1, 0.5), "about y): give points with z up"),
+    "pitch": (lambda points, _: points @ rotations_about(1, 0.5), "about y.: give points with z up"),
     "roll": (lambda points, _: points @ rotations_about(0, -0.4), "data.ego_T_lidar"),
-    "slight pitch": (lambda points, _: points @ rotations_about(1, np.radians(8)), "8 degrees (turn it by +8 about y)"),
+    "slight pitch": (
+        lambda points, _: points @ rotations_about(1, np.radians(8)),
+        "[89] degrees .turn it by .[89] about y",
+    ),
     "slight roll": (
         lambda points, _: points @ rotations_about(0, np.radians(-12)),
-        "12 degrees (turn it by -12 about x)",
+        "12 degrees .turn it by -12 about x",
     ),
     "both": (
         lambda points, _: points @ rotations_about(1, 0.1) @ rotations_about(0, 0.15),
-        "+6 about y and +9 about x",
+        "[67] about y and .9 about x",
     ),
 }
 # Those with a factor or a rotation like that of another one.
@@ -737,14 +760,37 @@ def test_wrong_units_and_axes_are_recognised(source, name, request):
         return np.concatenate([change(points, pose), np.zeros((8, 3)), np.full((2, 3), 5.0)])
 
     masks = {"masks": False}
-    (text,) = [text for text in find_problems(Wrong(good, points=with_strays, **masks)) if "sweep" in text][:1]
-    assert found in text
+    (text,) = [
+        text for text in find_problems(Wrong(good, points=with_strays, **masks)) if re.search("sweep|tilt", text)
+    ][:1]
+    assert re.search(found, text)
     if found.startswith("about y"):
         told = float(re.findall(r"turn it by \+(\d+)", text)[0])
         assert abs(told - np.degrees(0.5)) < 3
     if "read_as=points" in found:
         again = read_as(Wrong(good, points=change, masks=False), found.split("=")[-1])
         assert judge_log(again).best == ()
+
+
+def test_a_sensor_that_tilts_for_a_moment_is_not_tilted(drive):
+    """A robot that rolls and pitches: its sweeps disagree. If they agree, the motion is judged, too."""
+
+    def tilted(angles):
+        tilts = np.stack([as_matrix(rotations_about(0, np.radians(angle))) for angle in angles])
+
+        class Tilted(Wrong):
+            def sweep(self, index):
+                sweep = super().sweep(index)
+                points = transform_points(sweep.points, np.linalg.inv(tilts[index]))
+                return replace(sweep, points=points.astype(np.float32))
+
+        return Tilted(drive, poses=lambda poses: poses @ tilts)
+
+    assert find_problems(tilted([6, -6] * 6)) == []
+    (problem,) = find_problems(tilted([25] * 12))
+    assert "tilted by about 25 degrees" in problem, "and nothing else"
+    page = {finding.topic: finding for finding in examine(tilted([10] * 12))}
+    assert "tilted by about 10 degrees" in page["frame"].text and page["ego motion"].status == RIGHT
 
 
 def test_points_in_feet_are_told_by_the_motion(drive):
@@ -872,6 +918,19 @@ def test_ground_masks_of_other_rows_and_of_all_points_are_recognised(request, so
     assert "empty, but the sweep contains ground" in mask_problem(Wrong(log, masks=np.zeros_like).sweep(0))
 
 
+@pytest.mark.parametrize(
+    ("share", "text"), [(0.0, "we find no ground in the first sweep"), (0.5, "we find other points than those")]
+)
+def test_a_mask_that_we_made_is_not_blamed_on_the_user(drive, monkeypatch, share, text):
+    def ground_of(points, _):
+        return np.random.default_rng(0).random(len(points)) < share
+
+    monkeypatch.setattr("cflow_torch.data.catalog.ground_of", ground_of)
+    log = GroundSegmentedLog(Wrong(drive, masks=False))
+    (problem,) = [each for each in find_problems(log) if each.startswith(text)]
+    assert "data.find_ground=grid" in problem
+
+
 def test_poses_of_the_lidar_are_told_from_those_of_the_vehicle(drive, tmp_path):
     """As who corrects a tilted LiDAR with poses from its own odometry, which the check advises."""
     tilt = as_matrix(rotations_about(1, np.radians(20)))
@@ -954,10 +1013,9 @@ def test_opening_a_log_warns_of_likely_mistakes(drive):
     with pytest.warns(CFlowWarning, match=f"log {drive.log_id}: .*static world moves"):
         check_log(Wrong(drive, poses=WRONG_POSES["inverted"]))
     few = Wrong(drive, points=lambda points, _: np.full((50, 3), 5.0), masks=False)
-    empty = Wrong(drive, points=lambda points, _: np.zeros((0, 3)), masks=False)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for good in (drive, few, empty, Wrong(drive, is_broken=True)):
+        for good in (drive, few, Wrong(drive, is_broken=True)):
             check_log(good)
 
 
@@ -1065,6 +1123,25 @@ def test_sweeps_without_a_finite_point_are_told_and_change_nothing_else(drive):
         warnings.simplefilter("error")
         (text,) = [one.text for one in examine(Wrong(drive, points=blank)) if one.status == WRONG]
     assert text.startswith("1 of them have few points, the first is sweep 0 with 0")
+
+
+def test_sweeps_without_points_are_told(drive):
+    with pytest.warns(CFlowWarning, match="no point is finite in the first sweep"):
+        check_log(Wrong(drive, points=lambda points, _: np.zeros((0, 3)), masks=False))
+
+
+@pytest.mark.parametrize("full", [[], [2, 5]])
+def test_sweeps_of_which_most_have_no_finite_point_are_told(drive, full):
+    class Blank(Wrong):
+        def sweep(self, index):
+            sweep = super().sweep(index)
+            return sweep if index in full else replace(sweep, points=np.full_like(sweep.points, np.nan))
+
+    log = Blank(drive)
+    quick = "no point is finite in the first sweep, sweep 5, sweep 11: are the files complete?"
+    assert find_problems(log) == ([] if full else [quick])
+    texts = [finding.text for finding in examine(log) if finding.status == WRONG]
+    assert len(texts) == 1 and texts[0].startswith("10 of them have few points" if full else quick)
 
 
 def twice(points, _):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -255,6 +256,7 @@ LAYOUTS = {
     ],
     "printed by NumPy": [line for pose in POSES for line in str(pose).splitlines()],
     "four lines": rows(POSES.reshape(48, 4)),
+    "four lines with a time": [line for k, pose in enumerate(POSES) for line in rows([*pose[:3], (0, 0, 0, k)])],
     "radians": ["t,x,y,z,roll,pitch,yaw", *rows([(k, *POSES[k, :3, 3], *ANGLES[k]) for k in range(12)], ",")],
     "degrees": ["x y z roll_deg pitch_deg yaw_deg", *rows(DEGREES)],
     "large angles": ["id,x,y,z,roll,pitch,heading", *rows([(k, *row) for k, row in enumerate(DEGREES)], ",")],
@@ -272,6 +274,7 @@ def test_layouts_of_poses(tmp_path, layout) -> None:
         "radians",
         "time, by columns",
         "time and angles",
+        "four lines with a time",
     )
     assert (read.times_ns is not None) == has_times and (not has_times or read.times_ns[2] == 2 * 10**9)
 
@@ -508,6 +511,17 @@ def test_files_that_nobody_named_stop_no_log(tmp_path, monkeypatch) -> None:
         assert not ArraysLog(numbered)._has_times
 
 
+def test_what_is_wrong_with_a_file_of_poses_is_told_once(tmp_path, monkeypatch) -> None:
+    folder = clouds(tmp_path / "drive")
+    lines = [line(k, seconds(START + k * 10**6)) for k in range(500)]
+    (folder / "poses_gt.txt").write_text("\n".join([*lines, line(9, seconds(START))]))
+    monkeypatch.chdir(tmp_path)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        assert ArraysLog(folder.name).poses is None
+    assert len([each for each in told if "we do not use poses_gt.txt" in str(each.message)]) == 1
+
+
 def locked(path: Any) -> Any:
     raise PermissionError(f"{path}: permission denied")
 
@@ -569,11 +583,14 @@ def test_unknown_poses_do_not_hide_where_the_vehicle_drives(tmp_path) -> None:
 
 
 def test_numbers_of_files_tell_missing_sweeps(tmp_path) -> None:
-    """Without times, a gap is found by the numbers, unless they are irregular."""
+    """Without times, a gap is found by the numbers. If they are irregular, it is ten times as long as others."""
     for name, numbers, gaps in (
         ("missing", (0, 2, 4, 8, 10, 12, 14), {2}),
         ("whole", range(5, 12), set()),
         ("irregular", (0, 1, 3, 4, 6, 9, 10), set()),
+        ("two pairs", (94, 95, 198, 199), {1}),
+        ("three", (0, 100, 101), {0}),
+        ("irregular, with a gap", (0, 1, 3, 4, 6, 9, 30), {5}),
     ):
         log = ArraysLog(clouds(tmp_path / name, numbers))
         assert log.gaps == gaps, name

@@ -19,6 +19,7 @@ from oracle.changed_pixels import find_changed
 from oracle.component_tree import Node, grow, select_objects
 from oracle.confidence import TABLE, margin, probabilities
 from oracle.height_slices import SlicedSweeps, Vector, ground_slope, is_residue, over_squares
+from oracle.low_points import pixels_of_low_points
 from oracle.paired_test import are_wide, count_wins, evidence_of
 from oracle.pixels import in_range
 from oracle.registration import register
@@ -76,6 +77,11 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
     )
     pixels = sweeps.pixel_of_point[len(drawn[0]) :][: len(drawn[1])]
     rows, pixels = drawn[1][is_inside[drawn[1]]], pixels[is_inside[drawn[1]]]
+    if config.min_height is not None:
+        low = np.setdiff1d(np.flatnonzero(clouds[0].is_active & is_inside), drawn[1])
+        is_dynamic = np.array([*(is_moving for _, is_moving in margins), False])  # the last one is of no object
+        near = pixels_of_low_points(sweeps, points[low], is_dynamic[object_of], ground, config)
+        rows, pixels = np.append(rows, low[near >= 0]), np.append(pixels, near[near >= 0])
     confidence[rows], moving[rows] = of_pixels[:, pixels]
     ids[rows] = object_of[pixels]
     for number in np.unique(ids[ids >= 0]).tolist():

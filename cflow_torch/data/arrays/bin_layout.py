@@ -15,7 +15,7 @@ _SHARE = 0.95  # of the numbers have such a size; of numbers read in a wrong typ
 _EXPLAINED, _AS_GOOD = 0.05, 0.9  # least share of the variance, and the share of the best that a smaller number needs
 _FARTHEST, _LONGEST_RECORD = 1e4, 64  # size of coordinates, and bytes of a record
 _FEWEST = 1000  # points of a file that tell its layout
-_FIX = "pass bin_columns, the numbers per point (4 in KITTI, 5 in nuScenes), or convert other types with numpy.save"
+_FIX = "give the numbers per point (data.bin_columns=4 in KITTI, 5 in nuScenes), or convert other types with numpy.save"
 _MOST, _BLOCK = 1 << 17, 840  # numbers that we test; a multiple of all numbers of columns
 
 

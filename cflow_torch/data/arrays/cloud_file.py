@@ -17,9 +17,9 @@ from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS, BinLayout, find_bi
 from cflow_torch.data.arrays.pcd import pcd_fields, pcd_viewpoint, pypcd4
 from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.column_names import AXES, default_names, first_coordinate, with_axes
+from cflow_torch.data.column_names import AXES, check_no_poses, default_names, first_coordinate, with_axes
 from cflow_torch.data.file_errors import file_errors, shortened
-from cflow_torch.data.paths import PathLike, as_path, read_bytes, suffix_of
+from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote, read_bytes, suffix_of
 from cflow_torch.tensors import resolution
 from cflow_torch.types import CFlowError, check_array
 
@@ -27,9 +27,9 @@ SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
 """Suffixes of clouds that are read and written. Texts (`cloud_text.SUFFIXES`), and `.gz` after any, are only read."""
 _COARSEST = 1e-3  # metres
 _LARGEST_POSE = 16  # numbers of an array that may be a pose
-_MOST_CHANNELS = 16  # of an organised cloud
+_MOST_CHANNELS = 16  # of an organised cloud, or of one that is transposed; more are the rows of an image
 _MOST_COLUMNS = 64  # of a cloud with fewer points than columns; more are those of a cloud that is transposed
-_TABLES: dict[str, Any] = {  # suffix -> function that reads, and one that writes
+TABLES: dict[str, Any] = {  # suffix -> function that reads, and one that writes
     ".feather": (feather.read_table, feather.write_feather),
     ".parquet": (parquet.read_table, parquet.write_table),
 }
@@ -152,7 +152,7 @@ def write_cloud(
         elif suffix == ".npz":
             np.savez(file, points=points, **named)
         else:
-            _TABLES[suffix][1](pa.table(fields), file)
+            TABLES[suffix][1](pa.table(fields), file)
 
 
 def copy_rows(source: PathLike, target: PathLike, is_kept: np.ndarray, layout: BinLayout | None = None) -> None:
@@ -181,7 +181,7 @@ def copy_rows(source: PathLike, target: PathLike, is_kept: np.ndarray, layout: B
             raise CFlowError(f"it has {number} points, and the mask {len(is_kept)}: give both of one sweep")
     with atomic_file(target) as file:
         if suffix in (".feather", ".parquet"):
-            read, write = _TABLES[suffix]
+            read, write = TABLES[suffix]
             write(read(pa.BufferReader(content), use_threads=False).filter(pa.array(is_kept)), file)
         elif suffix == ".npy":
             np.save(file, _by_rows(np.load(io.BytesIO(content), allow_pickle=False))[is_kept])
@@ -246,7 +246,7 @@ def _read(path: Path, bin_columns: int | BinLayout | None) -> Mapping[str, np.nd
     if suffix in (".pcd", ".ply"):
         return (pcd_fields if suffix == ".pcd" else ply_fields)(content)
     if suffix in (".feather", ".parquet"):
-        return _table_columns(_TABLES[suffix][0], content)
+        return _table_columns(TABLES[suffix][0], content)
     if suffix == ".npz":
         return _archive_columns(content)
     if suffix == ".npy":
@@ -255,7 +255,7 @@ def _read(path: Path, bin_columns: int | BinLayout | None) -> Mapping[str, np.nd
     if len(content) % layout.step:
         raise CFlowError(
             f"it has {len(content)} bytes, not a multiple of {layout.step} ({layout}): it is truncated, or has another "
-            "number of columns (bin_columns: 4 in KITTI, 5 in nuScenes)"
+            "number of columns (data.bin_columns=4 in KITTI, 5 in nuScenes)"
         )
     return _array_columns(layout.table(content))
 
@@ -270,17 +270,41 @@ def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:
     array = _by_rows(array)
     if array.dtype.names is not None:
         return {name: array[name] for name in array.dtype.names}
-    if array.ndim != 2 or array.shape[1] < 3 or array.shape[1] > max(_MOST_COLUMNS, len(array)):
+    if not _is_table(array.shape):
         raise CFlowError(f"it has an array of shape {array.shape}; it must be (N, 3+), columns x, y, z first")
     columns = list(array.T)
     columns = columns[first_coordinate(columns) :]
     return dict(zip(default_names(len(columns)), columns))
 
 
+def names_in_table(path: Path) -> list[str]:
+    """Return the names of the columns of a `.feather` or `.parquet` file, without its rows; [] = unknown."""
+    if is_remote(path):  # we would copy the whole file
+        return []
+    with suppress(CFlowError), file_errors(path), open(check_file(path), "rb") as file:
+        is_parquet = suffix_of(path) == ".parquet"
+        schema = parquet.read_schema(file) if is_parquet else pa.ipc.open_file(file).schema
+        return list(schema.names)
+    return []
+
+
+def may_be_cloud(shape: Sequence[int]) -> bool:
+    """Test whether an array of numbers may be a cloud by its shape, not an image, a map, or a column of labels."""
+    return len(shape) == 3 or _is_transposed(shape) or _is_table(shape)
+
+
+def _is_table(shape: Sequence[int]) -> bool:
+    return len(shape) == 2 and 3 <= shape[1] <= max(_MOST_COLUMNS, shape[0])
+
+
+def _is_transposed(shape: Sequence[int]) -> bool:
+    return len(shape) == 2 and 3 <= shape[0] <= _MOST_CHANNELS and shape[1] > _MOST_COLUMNS
+
+
 def _by_rows(array: np.ndarray) -> np.ndarray:
     """Return an organised cloud, (H, W), (H, W, C) or (C, H, W), or a transposed one, (C, N), with a row per point."""
     num_axes = 1 if array.dtype.names is not None else 2
-    if array.ndim == num_axes == 2 and 3 <= len(array) <= _MOST_COLUMNS < array.shape[1]:
+    if num_axes == 2 and _is_transposed(array.shape):
         return array.T
     if array.ndim == num_axes + 1 == 3 and 3 <= len(array) <= _MOST_CHANNELS < array.shape[2]:
         array = np.moveaxis(array, 0, -1)
@@ -316,6 +340,7 @@ def _archive_columns(content: bytes) -> dict[str, np.ndarray]:
 def _table_columns(read: Any, content: bytes) -> dict[str, np.ndarray]:
     table = read(pa.BufferReader(content), use_threads=False)
     table.validate(full=True)
+    check_no_poses(table.column_names)
     names = with_axes(table.column_names)
     if not set(AXES) <= set(names):
         begin = first_coordinate([column.to_numpy() for column in table.columns])

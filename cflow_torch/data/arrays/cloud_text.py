@@ -9,7 +9,7 @@ import pyarrow as pa
 from pyarrow import csv
 
 from cflow_torch.data.arrays.tables import split_line, start_of_rows
-from cflow_torch.data.column_names import AXES, default_names, first_coordinate, with_axes
+from cflow_torch.data.column_names import AXES, check_no_poses, default_names, first_coordinate, with_axes
 from cflow_torch.types import CFlowError
 
 SUFFIXES = (".csv", ".txt", ".xyz", ".pts", ".asc")
@@ -44,6 +44,7 @@ def text_columns(content: bytes) -> dict[str, np.ndarray]:
     table = csv.read_csv(pa.BufferReader(content), **options)
     columns = [column.to_numpy() for column in table.columns]
     if names:
+        check_no_poses(names)
         names = with_axes(names)
     else:
         has_numbers = (

@@ -12,9 +12,10 @@ from typing import Any, Callable, Container, Dict, List, Mapping, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays import cloud_text
-from cflow_torch.data.arrays.cloud_file import SUFFIXES
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, TABLES, may_be_cloud, names_in_table
 from cflow_torch.data.arrays.poses_text import STRUCTURED, files_of_poses, parse_poses, parse_times, read_poses
 from cflow_torch.data.arrays.stamps import times_of_names
+from cflow_torch.data.column_names import are_of_poses
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders, natural_key, record_in, visible
 from cflow_torch.data.paths import PathLike, as_path, is_remote, read_start, stem_of, suffix_of
@@ -114,7 +115,7 @@ def _kinds(folder: Path) -> _Kinds:
     """
     files = [path for path in visible(folder) if stem_of(path).lower() not in _OTHER_STEMS]
     kinds = _alike([path for path in files if suffix_of(path) in SUFFIXES])
-    kinds = {kind: same for kind, same in kinds.items() if not _is_column(min(same))}
+    kinds = {kind: same for kind, same in kinds.items() if not _has_no_points(min(same))}
     texts = [path for path in files if suffix_of(path) in cloud_text.SUFFIXES]
     counts = Counter(map(_pattern, texts))
     texts = [] if kinds else [path for path in texts if counts[_pattern(path)] > 1]
@@ -152,8 +153,10 @@ def _pattern(path: Path) -> str:
     return _COUNTERS.sub("*", stem_of(path)) + suffix_of(path)
 
 
-def _is_column(path: Path) -> bool:
-    """Test whether a `.npy` file has one or two numbers per point, such as labels or masks."""
+def _has_no_points(path: Path) -> bool:
+    """Test whether a file has no points, by the shape of an array (labels, masks, images) or its names (poses)."""
+    if path.suffix.lower() in TABLES:
+        return are_of_poses(names_in_table(path))
     if path.suffix.lower() != ".npy":
         return False
     try:
@@ -163,7 +166,7 @@ def _is_column(path: Path) -> bool:
             shape, _, kind = np.lib.format.read_array_header_1_0(file)
     except CFlowError:
         return False
-    return kind.kind in "biuf" and (len(shape) == 1 or (len(shape) == 2 and shape[0] > 2 and 0 < shape[1] < 3))
+    return kind.kind in "biuf" and not may_be_cloud(shape)
 
 
 def _is_text_cloud(path: Path) -> bool:
@@ -196,7 +199,8 @@ def find_clouds(folder: Path, suffix: str | None) -> list[Path]:
             f"({suffix or ', '.join((*SUFFIXES, *cloud_text.SUFFIXES))}); scene flow needs two or more"
         )
     if len(kinds) > 1:
-        raise CFlowError(f"{parent} has several kinds of clouds, {', '.join(sorted(kinds))}: choose one by suffix=...")
+        choose = f"choose one, such as data.suffix='{min(kinds)}'"
+        raise CFlowError(f"{parent} has several kinds of clouds, {', '.join(sorted(kinds))}: {choose}")
     files = sorted(next(iter(kinds.values())), key=lambda path: natural_key(stem_of(path)))
     twice = next((one for one, other in zip(files, files[1:]) if stem_of(one) == stem_of(other)), None)
     if twice is not None:
@@ -223,7 +227,7 @@ def only_one(found: Sequence[Path], folder: Path, what: str) -> Path | None:
     """Return the only file that was found; None = none. Several are a `CFlowError`."""
     if len(found) > 1:
         several = ", ".join(path.name for path in found)
-        raise CFlowError(f"{folder} has several files for {what}: {several}; choose one with {what}=...")
+        raise CFlowError(f"{folder} has several files for {what}: {several}; choose one with data.{what}=FILE")
     return found[0] if found else None
 
 
@@ -279,9 +283,12 @@ def find_poses(
     named = only_one(called, folder, "poses")
     if named is not None or kitti.exists():
         return read_poses(named or kitti)
-    read = read_all([path for each in folders for path in find_pose_files(each, clouds)], read_poses, tell)
+    files = [path for each in folders for path in find_pose_files(each, clouds)]
+    read = read_all(files, read_poses, tell)
     found = {path: each for path, each in read.items() if fits(each)}
-    near = None if found else find_poses_near(folder, top.name, times_ns, fits, tell, clouds)
+    # Files that were read here are not read again there, so what is wrong with them is told once.
+    known = {*clouds, *(path.resolve() for path in files)}
+    near = None if found else find_poses_near(folder, top.name, times_ns, fits, tell, known)
     if near is not None:
         return near
     found = found or {path: each for path, each in read.items() if suffix_of(path) in _NEAR_TABLES}

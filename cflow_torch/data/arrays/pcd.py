@@ -1,16 +1,16 @@
-"""Point clouds in the PCD format, by pypcd4 (extra `clouds`), with the headers that programs write."""
+"""Point clouds in the PCD format with the headers that programs write; binary ones by pypcd4 (extra `clouds`)."""
 
 from __future__ import annotations
 
 import io
 import re
-from typing import Any
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 
 from cflow_torch.data.arrays.cloud_text import with_plain_nan
-from cflow_torch.data.column_names import distinct_names
-from cflow_torch.errors import import_optional
+from cflow_torch.data.column_names import AXES, distinct_names
+from cflow_torch.errors import import_optional, warn
 
 LONGEST_HEADER = 65536  # bytes
 _DATA = re.compile(rb"^[ \t]*DATA[ \t]+(\w+)[ \t]*\r?\n", re.MULTILINE | re.IGNORECASE)
@@ -24,17 +24,67 @@ def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
     file that is damaged or not a `.pcd` file may raise any exception, which the caller reports.
     """
     header, end = _header(content)
+    if header["DATA"] == ["ascii"]:
+        return _text_fields(content[end:], header)
     text = "".join(f"{key} {' '.join(words)}\n" for key, words in header.items())
-    body = with_plain_nan(content[end:]) if header["DATA"] == ["ascii"] else content[end:]
-    cloud = pypcd4().PointCloud.from_fileobj(io.BytesIO(text.encode("utf-8") + body))
-    width, height = int(header["WIDTH"][0]), int(header["HEIGHT"][0])
+    cloud = pypcd4().PointCloud.from_fileobj(io.BytesIO(text.encode("utf-8") + content[end:]))
     table = np.atleast_1d(cloud.pc_data)
-    if len(table) != width * height:
-        raise ValueError(f"it has {len(table)} points, but its header states {width} x {height}")
+    _check_number(len(table), header)
     # pypcd4 splits fields of several values, and mixes these fields up in compressed files.
     names = [name for name, count in zip(header["FIELDS"], header["COUNT"]) if int(count) == 1 and name != "_"]
     # pypcd4 1.4 makes a two-dimensional table of a cloud without points.
     return {name: np.ascontiguousarray(table[name]).reshape(-1) for name in names}
+
+
+def _check_number(count: int, header: Mapping[str, Sequence[str]]) -> None:
+    width, height = int(header["WIDTH"][0]), int(header["HEIGHT"][0])
+    if count != width * height:
+        raise ValueError(f"it has {count} points, but its header states {width} x {height}")
+
+
+def _text_fields(body: bytes, header: Mapping[str, Sequence[str]]) -> dict[str, np.ndarray]:
+    """Read the fields of a text. Those besides x, y, z that are not numbers are left out, and we say so.
+
+    PCL writes fields of one byte as characters, of which some are blanks or ends of lines.
+    """
+    names = header["FIELDS"]
+    columns = np.cumsum([0, *map(int, header["COUNT"])]).tolist()  # of the first value of each field, and the end
+    needed = [k for k, name in enumerate(names) if name.lower() in AXES] or list(range(len(names)))
+    lines = [line.split() for line in with_plain_nan(body).splitlines()]
+    rows = [words for words in lines if len(words) > columns[max(needed)]]
+    _check_number(len(rows), header)
+    if rows and len(rows[-1]) < columns[-1] and all(len(words) >= columns[-1] for words in rows[:-1]):
+        raise ValueError("its last line is not complete")
+    fields, left_out = {}, []
+    for k, name in enumerate(names):
+        if int(header["COUNT"][k]) > 1 or name == "_":
+            continue
+        try:
+            kind = np.dtype(f"{header['TYPE'][k].lower()}{header['SIZE'][k]}")
+            fields[name] = _numbers([words[columns[k]] for words in rows], kind)
+        except (ValueError, IndexError, OverflowError):
+            if k in needed:
+                raise
+            left_out.append(name)
+    if left_out:
+        warn(f"the fields {', '.join(left_out)} of .pcd files hold characters, not numbers, so we leave them out")
+    return fields
+
+
+def _numbers(words: Sequence[bytes], kind: np.dtype[Any]) -> np.ndarray:
+    """Return the numbers in words; those that the type does not have are a ValueError."""
+    texts = np.array(words, np.bytes_)
+    if kind.kind == "f":
+        return texts.astype(kind)
+    try:
+        numbers = texts.astype(np.uint64 if kind == np.uint64 else np.int64)
+    except ValueError:
+        numbers = texts.astype(np.float64)  # 7.000000
+    with np.errstate(invalid="ignore"):  # of NaN, which is found below
+        found = numbers.astype(kind)
+    if not np.array_equal(found, numbers):
+        raise ValueError(f"it has numbers that {kind.name} does not have")
+    return found
 
 
 def pcd_viewpoint(content: bytes) -> np.ndarray | None:
@@ -66,6 +116,8 @@ def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
     has_values = [int(count) > 0 for count in columns["COUNT"]]
     columns = {key: [word for word, has in zip(column, has_values) if has] for key, column in columns.items()}
     width, height = words.get("WIDTH") or words["POINTS"], words.get("HEIGHT") or ["1"]
+    if int(width[0]) * int(height[0]) == 0:  # PCL writes so the points of a cloud whose size was not set
+        width, height = words.get("POINTS") or width, ["1"]
     size = {"WIDTH": width, "HEIGHT": height}
     rest = {"VIEWPOINT": words.get("VIEWPOINT") or ["0", "0", "0", "1", "0", "0", "0"]}
     points = {"POINTS": [str(int(width[0]) * int(height[0]))], "DATA": [data[1].decode("ascii").lower()]}

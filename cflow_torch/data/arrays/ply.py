@@ -17,6 +17,7 @@ from cflow_torch.data.column_names import distinct_names
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _NAMES = dict(zip(_CODES, ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")))
 _TYPES = {name: code for code in _CODES for name in (_NAMES[code], np.dtype(code).name)}  # "char" and "int8"
+_TYPES["bool"] = "u1"  # of no standard, but written
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 65536  # bytes
 _HEADER = re.compile(rb"ply\s(.*?)(?<=[\r\n])end_header[ \t]*(?:\r\n|\r|\n)", re.DOTALL)

@@ -52,9 +52,10 @@ def read_poses(path: PathLike) -> Trajectory:
             time in seconds, tx ty tz, qx qy qz qw, the scalar LAST), 7 (without the time), 16 (the matrix by rows, or
             by columns), 13 or 17 (a time before the matrix), or 9 (the number of the row before TUM). 7 numbers without
             a quaternion are a time, x y z, roll pitch yaw; 6 have no time. Four lines may have a matrix, below a line
-            of three numbers (Open3D). Of a g2o graph, vertices are read. If a line before the numbers names the columns
-            (timestamp, x, qw, ...), they may have any order, and roll, pitch and yaw may replace the quaternion. Other
-            columns, empty lines and comments (`COMMENTS`) are ignored. Times: `nanoseconds_of_numbers`.
+            of three numbers (Open3D). The last number of matrices may be a time in place of 1. Of a g2o graph, vertices
+            are read. If a line before the numbers names the columns (timestamp, x, qw, ...), they may have any order,
+            and roll, pitch and yaw may replace the quaternion. Other columns, empty lines and comments (`COMMENTS`) are
+            ignored. Times: `nanoseconds_of_numbers`.
 
     Convention: yaw turns x to y, pitch then z to x, roll then y to z. What is not named of z, roll and pitch is 0. The
         angles are degrees if their name says so, or one is larger than 2 pi, else radians. A quaternion q0 to q3 has w
@@ -107,6 +108,8 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
         words = words.reshape(-1, 16)
     roles = _roles(names)
     unnamed = _UNNAMED.get(words.shape[1], ())
+    if unnamed == MATRIX and not (words[:, 15].astype(np.float64) == 1).all() and _are_homogeneous(words[:, 12:]):
+        unnamed = (*MATRIX[:12], *["row"] * 3, "time")
     if words.shape[1] in (6, 7) and not names and not _end_in_quaternions(words):
         unnamed = _UNNAMED_ANGLES[7 - words.shape[1] :]
     if unnamed[:1] == ("row",) and not (np.diff(words[:, 0].astype(np.float64)) == 1).all():
@@ -141,7 +144,10 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
 
 
 def _are_homogeneous(rows: np.ndarray) -> bool:
-    return bool((rows.astype(np.float64) == (0, 0, 0, 1)).all())
+    """Test whether rows, (K, 4), are the last ones of matrices: 0, 0, 0, and 1 or, as some programs write, a time."""
+    numbers = rows.astype(np.float64)
+    last = numbers[:, 3]
+    return not numbers[:, :3].any() and bool((last == 1).all() or (np.diff(last) > 0).all())
 
 
 def _end_in_quaternions(words: np.ndarray) -> bool:

@@ -41,6 +41,7 @@ _VIEWPOINT = "VIEWPOINT"  # source of poses that come with the clouds
 _LEAST_NAMED = 0.5  # share of the sweeps whose numbers poses have, if poses have numbers
 _LEAST_REACH = 0.8  # part of a table after which the row of the last file is, unless the layout says so
 _LEAST_USUAL = 2 / 3  # share of steps between the numbers of files that are equal, or the numbers are irregular
+_LONG_STEP = 10  # usual steps between irregular numbers; a longer one is a gap
 
 
 class ArraysLog(Log):
@@ -136,8 +137,8 @@ class ArraysLog(Log):
         points, columns = read_table(self.files[index], self._bin_columns)
         time = self.timestamps[index] if self._has_times else None
         period = float(np.median(np.diff(self.timestamps))) * 1e-9 if self._has_times else None
-        times = find_times(columns, time, period, self._note)
         is_missing = missing_returns(points)
+        times = find_times(columns, time, period, self._note, is_missing)
         if times is not None:
             is_missing |= times.is_stray
         if is_missing.any():
@@ -326,7 +327,7 @@ class ArraysLog(Log):
             if given is None:
                 raise CFlowError(
                     f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, or poses "
-                    "with times (TUM) and the times of the sweeps in times.txt, or no poses"
+                    "with times (TUM) and the times of the sweeps in times.txt, or none (data.poses=null)"
                 )
             rows = given
             is_known = np.isfinite(trajectory.poses[rows]).all(axis=(1, 2)) & (rows >= 0)
@@ -342,8 +343,10 @@ class ArraysLog(Log):
         """Return the indices of files without times after which others are missing, by the numbers in their names."""
         numbers = [_number_of(stem_of(path)) for path in self.files]
         steps = np.diff(numbers)
-        gaps = [gap for gap in np.flatnonzero(steps > np.median(steps)).tolist() if gap not in self.gaps]
-        if self._has_times or not gaps or not _are_regular(numbers):
+        usual = np.sort(steps)[(len(steps) - 1) // 2]
+        longest = usual if _are_regular(numbers) else _LONG_STEP * usual
+        gaps = [gap for gap in np.flatnonzero(steps > longest).tolist() if gap not in self.gaps]
+        if self._has_times or not gaps or steps.min() <= 0:
             return []
         first = self.files[gaps[0]].name
         missing = f"sweeps are missing by the numbers of its files, first after {first}"
@@ -361,7 +364,7 @@ def _of_ego(trajectory: Trajectory, whose: str, mounting: np.ndarray) -> Traject
 def _are_regular(numbers: Sequence[int]) -> bool:
     """Test whether numbers of files ascend, most by the same step."""
     steps = np.diff(numbers)
-    return bool(steps.min() > 0 and (steps == np.median(steps)).mean() > _LEAST_USUAL)
+    return bool(steps.min() > 0 and (steps == np.median(steps)).mean() >= _LEAST_USUAL)
 
 
 def _number_of(stem: str) -> int:
@@ -379,7 +382,7 @@ def _drives_along_x(poses: np.ndarray) -> bool:
 
 def _read_mask(folder: Path, stem: str, rows: int) -> np.ndarray:
     file = folder / f"{stem}.npy"
-    mask = read_npy(file, "every sweep needs its ground mask, or pass ground=None")
+    mask = read_npy(file, "every sweep needs its ground mask, or set data.ground=null")
     if mask.shape not in ((rows,), (rows, 1)) or mask.dtype.kind not in "biu" or not np.isin(mask, (0, 1)).all():
         raise CFlowError(f"{file} has shape {mask.shape} and dtype {mask.dtype} for {rows} points; masks are (N,) bool")
     return mask.reshape(rows).astype(bool)

@@ -246,6 +246,8 @@ class BagLog(Log):
                 if _CLOUD in types and not found and kind.split("/")[-1] in _CONVERTERS:
                     tool = _CONVERTERS[kind.split("/")[-1]]
                     raise CFlowError(f"{topic} has messages {kind}, which we do not decode: convert it with {tool}")
+            if not found and not name:
+                raise CFlowError(f"it has no topic of type {' or '.join(types)}; it has {available or 'no messages'}")
             raise CFlowError(
                 f"{what} of type {' or '.join(types)}: choose one with {setting}=NAME, "
                 f"in commands data.{setting}=NAME; the bag has {available}"

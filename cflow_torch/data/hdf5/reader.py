@@ -107,7 +107,7 @@ class HDF5Log(Log):
         rows, timestamp = self._rows(index), self.timestamps[index]
         points = self._values(index, "lidar")[:, :3]
         points = points if points.dtype == np.float64 else points.astype(np.float32)
-        is_missing = missing_returns(points)
+        is_missing = missing_returns(points) | (np.abs(points) > np.finfo(np.float32).max).any(axis=1)
         if is_missing.any():
             points = np.where(is_missing[:, None], points.dtype.type(np.nan), points)
         is_ground = self._values(index, "ground_mask", rows, np.bool_)
@@ -131,7 +131,7 @@ class HDF5Log(Log):
         if times is None or np.abs(times).max(initial=0) <= _LONGEST_LAG:
             return times if times is None else times.astype(np.float32)
         period = None if time is None else float(np.median(np.diff(self.timestamps))) * 1e-9
-        found = find_times({"time": times}, time, period, self._note)
+        found = find_times({"time": times}, time, period, self._note, missing_returns(points[:, :3]))
         if found is None or found.seconds is None:
             return None
         points[found.is_stray] = np.nan

@@ -117,8 +117,7 @@ class NuScenesLog(Log):
         self._tables = source.tables or Tables(folder)
         sample_times, annotations = self._tables.scene(source.name)
         known = self._tables.chains(source.name, "lidar")
-        with file_errors(folder / "category.json"):
-            category_indices(annotations.category, self._categories)
+        category_indices(annotations.category, self._categories)  # says which are unknown
         missing = [] if lidars is None else [name for name in lidars if name not in known]
         if missing or not known:
             raise CFlowError(f"scene {self.log_id} in {folder} has no LiDAR {missing or ''}; it has {list(known)}")
