@@ -302,9 +302,10 @@ def _mask(log: _CheckedLog) -> list[Finding]:
     for index in known:
         problem = "" if log.frame[1] or log.tilt else mask_problem(log.sweep(index))
         if problem:
-            text = f"the mask of {_name_of(index)} is {problem}"
-            if log.unwrapped.sweep(index).is_ground is None:  # we made it
-                mask: Any = masks[index]
+            text = f"the mask of {_name_of(index)} is {problem}; data.find_ground=grid replaces it"
+            mask: Any = masks[index]
+            is_replaced = getattr(log, "wrong_masks", "")  # of `GroundSegmentedLog`
+            if log.unwrapped.sweep(index).is_ground is None or is_replaced:  # we made it
                 what = "other points than those of the ground" if as_numpy(mask).any() else "no ground"
                 text = f"we find {what} in {_name_of(index)}, which has some: {_OTHER_GROUND}"
             return [Finding("ground", WRONG, text, True)]

@@ -859,6 +859,17 @@ def test_sweeps_of_half_a_view_are_told_once(whole):
     assert len(wrong) == 1 and re.search("share [1-5]?[0-9] % of the directions", wrong[0])
 
 
+def test_a_chosen_method_replaces_wrong_masks_only(drive):
+    inverted = Wrong(drive, masks=np.logical_not)
+    chosen = GroundSegmentedLog(inverted, "grid")
+    (text,) = find_problems(chosen)
+    assert text == "a mask of the log is not that of points that lie low, so find_ground=grid replaces all masks"
+    assert (chosen.sweep(3).is_ground == drive.sweep(3).is_ground).mean() > 0.9
+    assert "data.find_ground=grid replaces it" in find_problems(inverted)[0]
+    assert np.array_equal(GroundSegmentedLog(inverted, "auto").sweep(3).is_ground, inverted.sweep(3).is_ground)
+    assert np.array_equal(GroundSegmentedLog(drive, "grid").sweep(3).is_ground, drive.sweep(3).is_ground)
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.6])
 def test_two_sensors_in_turns_are_told_and_nothing_else(drive, angle):
     T_points_second = np.linalg.inv(as_matrix(rotations_about(2, angle), (-1.5, 0, 0.4)))
