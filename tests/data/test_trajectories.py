@@ -247,6 +247,8 @@ LAYOUTS = {
     "trajectory of Open3D": [line for k, pose in enumerate(POSES) for line in (f"{k} {k} {k + 1}", *rows(pose))],
     "time and angles": rows([(k, *POSES[k, :3, 3], *ANGLES[k]) for k in range(12)], ","),
     "angles": rows([(*POSES[k, :3, 3], *ANGLES[k]) for k in range(12)]),
+    "quaternion x y z w first": rows([(*q[1:], q[0], *pose[:3, 3]) for q, pose in zip(QUATERNIONS, POSES)]),
+    "time, quaternion w first": rows([(k, *QUATERNIONS[k], *POSES[k, :3, 3]) for k in range(12)]),
     "vertices of g2o": [
         *(
             f"VERTEX_SE3:QUAT {k} {rows([[*POSES[k, :3, 3], *QUATERNIONS[k][1:], QUATERNIONS[k][0]]])[0]}"
@@ -274,6 +276,7 @@ def test_layouts_of_poses(tmp_path, layout) -> None:
         "radians",
         "time, by columns",
         "time and angles",
+        "time, quaternion w first",
         "four lines with a time",
     )
     assert (read.times_ns is not None) == has_times and (not has_times or read.times_ns[2] == 2 * 10**9)
