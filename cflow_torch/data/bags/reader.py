@@ -49,6 +49,8 @@ _REPAIR = "a recording that was cut off is repaired by rosbag reindex (.bag), mc
 _POSE_TYPES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/Pose{name}Stamped" for name in ("", "WithCovariance")))
 _OTHER_POSES = ("nav_msgs/msg/Path", "geometry_msgs/msg/TransformStamped")  # used if there are no others
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_MOVING = (*_TF_TYPES, *_POSE_TYPES)
+_MOST_OTHERS = 10  # bags next to one without poses, in which we look for some
 _ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by less
 _LARGEST_DELAY = 500_000_000  # nanoseconds by which messages arrive later than others
 _EARLY = 100_000_000  # nanoseconds; a message that arrives so long before its time has another clock than the recorder
@@ -168,7 +170,31 @@ class BagLog(Log):
             return Trajectory(matrices, times, False, f"{source} of {self.path}")
         if poses is None:
             return None
-        return find_poses_near(self.path.parent, self.log_id, self.timestamps, self._is_covered_by, self._note)
+        near = find_poses_near(self.path.parent, self.log_id, self.timestamps, self._is_covered_by, self._note)
+        if near is None:
+            self._note(self._other_bag_with_poses())
+        return near
+
+    def _other_bag_with_poses(self) -> str:
+        """Name a bag next to this one that has poses of the same time; "" = there is none."""
+        arrived = [arrival for arrival, _ in self._clouds.values()]
+        parent = self.path.resolve().parent
+        folders = [parent, *(path for path in visible(parent) if path.is_dir())]
+        bags = [bag for folder in folders for bag in _bags_in(folder) if not bag.samefile(self.path)]
+        for bag in sorted(bags)[:_MOST_OTHERS]:
+            try:
+                reader = self._open(_parts(bag))
+            except Exception:  # of any library, about a file that nobody asked for
+                continue
+            kinds = {each.topic: each.msgtype for each in reader.connections}
+            is_late, is_early = reader.start_time > max(arrived), reader.end_time < min(arrived)
+            reader.close()
+            moving = sorted(topic for topic, kind in kinds.items() if kind in _MOVING and topic != "/tf_static")
+            if moving and not (is_late or is_early):
+                other = bag.relative_to(parent)
+                what = f"{other} next to it has {', '.join(moving)} of the same time, which we do not read"
+                return f"{what}: merge both by rosbags-convert --src {self.path.name} {other} --dst merged"
+        return ""
 
     def _is_covered_by(self, trajectory: Trajectory) -> bool:
         return trajectory.covers(self.timestamps)
@@ -211,20 +237,24 @@ class BagLog(Log):
     def _reader(self) -> Any:
         """Return the open bag. Each process opens it itself, also after a fork or unpickling."""
         if self._opened[0] != os.getpid():
-            rosbags, types = (import_optional(f"rosbags.{name}", _NEED) for name in ("highlevel", "typesys"))
-            for path in self._files:
-                for file in [path] if path.is_file() else path.iterdir():
-                    check_file(file)
-            _check_version(self._files)
-            # Bags of ROS 2 before Iron do not describe their messages. The types that we read never changed.
-            types_of_old_bags = types.get_typestore(types.Stores.ROS2_HUMBLE)
-            for name in _LIVOX:
-                for kind, definition in (("CustomPoint", _CUSTOM_POINT), ("CustomMsg", _CUSTOM_MSG)):
-                    types_of_old_bags.register(types.get_types_from_msg(definition, name.replace("CustomMsg", kind)))
-            reader = rosbags.AnyReader(self._files, default_typestore=types_of_old_bags)
-            reader.open()
-            self._opened = (os.getpid(), reader)
+            self._opened = (os.getpid(), self._open(self._files))
         return self._opened[1]
+
+    def _open(self, files: list[Path]) -> Any:
+        """Open files as one bag."""
+        rosbags, types = (import_optional(f"rosbags.{name}", _NEED) for name in ("highlevel", "typesys"))
+        for path in files:
+            for file in [path] if path.is_file() else path.iterdir():
+                check_file(file)
+        _check_version(files)
+        # Bags of ROS 2 before Iron do not describe their messages. The types that we read never changed.
+        types_of_old_bags = types.get_typestore(types.Stores.ROS2_HUMBLE)
+        for name in _LIVOX:
+            for kind, definition in (("CustomPoint", _CUSTOM_POINT), ("CustomMsg", _CUSTOM_MSG)):
+                types_of_old_bags.register(types.get_types_from_msg(definition, name.replace("CustomMsg", kind)))
+        reader = rosbags.AnyReader(files, default_typestore=types_of_old_bags)
+        reader.open()
+        return reader
 
     def close(self) -> None:
         """Close the bag. A sweep that is read later opens it again."""
