@@ -250,8 +250,8 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
         text = f"{judgement.given:.2f} of the static structure is in place some sweeps later"
         return [Finding("ego motion", RIGHT, text + ("" if has_poses else ", without poses"), True)]
     if log.has_estimated_poses:
-        share = f"only {judgement.given:.2f} of the static structure is in place"
-        text = f"the poses that we estimated from the points do not fit well ({share}): give measured poses, if any"
+        fit = f"only {judgement.given:.2f} of the static structure is in place"
+        text = f"the poses that we estimated from the points do not fit well ({fit}): give measured poses, if any"
         return [Finding("ego motion", WRONG, text, True)]
     name = judgement.best[0]
     if name == UNKNOWN:
