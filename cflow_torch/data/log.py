@@ -352,7 +352,8 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
     """Read the window for the flow from sweep `index` to sweep `index + 1`.
 
     It has fewer than `num_history` older or `num_future` later sweeps at the ends of the log, at its gaps and, with a
-    warning, at a sweep that cannot be read. A pair that cannot be read is a `CFlowError`.
+    warning, at a sweep whose file is missing or damaged. A pair that cannot be read is a `CFlowError`, and so is
+    another sweep that the file system does not give.
     """
     count = len(log.timestamps)
     if not 0 <= index < count - 1:
@@ -364,16 +365,23 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
 
 
 def _readable(log: Log, indices: range) -> Iterator[Sweep]:
-    """Yield the sweeps of a history or future, up to a gap of the log or a sweep that cannot be read."""
+    """Yield the sweeps of a history or future, up to a gap of the log or a sweep whose file is missing or damaged."""
     for index in indices:
         if (index if indices.step < 0 else index - 1) in log.gaps:
             return
         try:
             sweep = log.sweep(index)
         except CFlowError as error:
+            if _may_pass(error):
+                raise
             warn(f"log {log.log_id}: windows near sweep {index} are shorter, because {error}")
             return
         yield sweep
+
+
+def _may_pass(error: BaseException | None) -> bool:
+    """Test whether the file system caused an error, such as a lost connection. Then the next run may read the sweep."""
+    return error is not None and (isinstance(error, OSError) or _may_pass(error.__cause__))
 
 
 def windows(log: Log, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:

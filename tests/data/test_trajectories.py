@@ -218,6 +218,10 @@ def test_a_missing_sweep_shortens_windows_and_fails_its_pairs(tmp_path) -> None:
     (tmp_path / f"{STAMPS[5]}.npy").write_bytes((tmp_path / "5.moved").read_bytes()[:100])
     with pytest.warns(CFlowWarning, match="windows near sweep 5 are shorter, because .* truncated or damaged"):
         assert len(window(log, 7, 4).pch) == 1
+    (tmp_path / f"{STAMPS[5]}.npy").unlink()
+    (tmp_path / f"{STAMPS[5]}.npy").mkdir()
+    with pytest.raises(CFlowError, match=str(STAMPS[5])):  # of the file system, so that the next run may read it
+        window(log, 7, 4)
 
 
 def test_a_vehicle_that_stands_has_a_pose_in_every_line(tmp_path: Path) -> None:
