@@ -20,7 +20,7 @@ class CFlowError(ValueError):
 
 
 class MissingFile(CFlowError):
-    """A file of a sweep does not exist. Windows that need it only as history or future are shorter."""
+    """A file does not exist."""
 
 
 class CFlowWarning(UserWarning):

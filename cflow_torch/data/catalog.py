@@ -5,7 +5,9 @@ from __future__ import annotations
 import inspect
 import logging
 from collections import Counter
+from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 from glob import glob
 from importlib import import_module
 from pathlib import Path
@@ -15,11 +17,13 @@ from cflow_torch.data.deskewing import DeskewedLog, check_deskew
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.finding import FOUND, Finding
 from cflow_torch.data.folders import distinct_names, find_folders, length_of_chain, visible
-from cflow_torch.data.log import CachedLog, Log, LogWrapper, add_gaps_in_time
+from cflow_torch.data.log import CachedLog, Log, LogWrapper, add_gaps_in_time, typical_sweeps
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, exist, is_path_like, remote_errors, safe_name, suffix_of
 from cflow_torch.data.read_as import read_as as read_log_as
+from cflow_torch.diagnosis.inspection import mask_problem
+from cflow_torch.diagnosis.point_frame import frame_problem
 from cflow_torch.errors import warn
 from cflow_torch.ground.segmentation import GROUND_METHODS, has_ground
 from cflow_torch.ground.segmentation import find_ground as ground_of
@@ -305,7 +309,8 @@ def open_log(
         name: a key of `DATA_SETS`, or the `target` that you gave `find_user_sources`.
         source: from `find_sources` or `find_user_sources`.
         find_ground: method of `cflow_torch.ground.find_ground` for sweeps without a ground mask, "grid" or
-            "patchwork"; "auto" = "grid", and `check` warns if it found ground; None = they stay without a mask.
+            "patchwork", which also replaces masks that are surely wrong; "auto" = "grid" for those without, and `check`
+            warns if it found ground; None = they stay without a mask.
         odometry: True = estimate poses from the points if the log has none; "refine" = also correct given poses.
         check: warn of likely mistakes, see `check_log`.
         read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`; or a
@@ -437,7 +442,7 @@ def open(path: Any, data: str = AUTO, **settings: Any) -> Log | Logs:
 class GroundSegmentedLog(LogWrapper):
     """A log with a ground mask for every sweep: the mask of the log if it has one, otherwise found from the points.
 
-    `method` is the `find_ground` of `open_log`.
+    `method` is the `find_ground` of `open_log`. A method that you choose also replaces masks that are surely wrong.
     """
 
     def __init__(self, log: Log, method: str = "grid") -> None:
@@ -446,13 +451,28 @@ class GroundSegmentedLog(LogWrapper):
 
     def sweep(self, index: int) -> Sweep:
         sweep = self.log.sweep(index)
-        if sweep.is_ground is not None:
+        if sweep.is_ground is not None and not self.wrong_masks:
             return sweep
         is_ground: Any = ground_of(sweep.points, self.method)
         return replace(sweep, is_ground=is_ground)
 
+    @cached_property
+    def wrong_masks(self) -> str:
+        """What is wrong with the masks of the log, by its typical sweeps, if a method is chosen; "" = nothing."""
+        if self.method == "auto":
+            return ""
+        with suppress(CFlowError, OSError):  # `sweep` raises the error
+            sweeps = [self.log.sweep(index) for index in typical_sweeps(self.log)]
+            masked = (sweep for sweep in sweeps if sweep.is_ground is not None and not frame_problem(sweep.points)[1])
+            return next(filter(None, map(mask_problem, masked)), "")
+        return ""
+
     def findings(self) -> list[Finding]:
         findings = self.log.findings()
+        if self.wrong_masks:
+            cause = self.wrong_masks.partition(":")[0].partition(",")[0]
+            text = f"a mask of the log is {cause}, so find_ground={self.method} replaces all masks"
+            return [*findings, Finding("ground", FOUND, text, True)]
         first = self.log.sweep(0)
         if self.method != "auto" or first.is_ground is not None or not has_ground(first.points):
             return findings

@@ -14,7 +14,7 @@ from cflow_torch.data.camera import Camera
 from cflow_torch.data.finding import Finding
 from cflow_torch.diagnosis.pair import LEAST_DISTANCE, is_around
 from cflow_torch.diagnosis.readings import Judgement
-from cflow_torch.errors import MissingFile, warn
+from cflow_torch.errors import warn
 from cflow_torch.transforms import poses_at
 from cflow_torch.types import CFlowError, Sweep, Window, as_numpy, check_array
 
@@ -58,6 +58,7 @@ class Log(ABC):
         is_compensated: True = the format is known to be compensated for ego motion within a sweep.
         has_raw_times: True = sweeps with `point_times` are expected not to be compensated.
         has_sparse_poses: True = most poses are interpolated between sweeps.
+        has_estimated_poses: True = we estimated the poses from the points (`cflow_torch.data.odometry`).
         lidar_position: (3,) metres, position of the rotating LiDAR in the frame of the points.
         has_viewpoints: True = the poses come with the clouds, which are then often in the world's frame.
         turn_seconds: duration of a turn of the LiDAR; None = the median time between two sweeps.
@@ -75,6 +76,7 @@ class Log(ABC):
     gaps: frozenset[int] = frozenset()
     has_viewpoints: bool = False
     has_sparse_poses: bool = False
+    has_estimated_poses: bool = False
     # What `cflow_torch.data.deskewing` must know of a reader.
     is_compensated: bool = False
     has_raw_times: bool = False
@@ -350,7 +352,8 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
     """Read the window for the flow from sweep `index` to sweep `index + 1`.
 
     It has fewer than `num_history` older or `num_future` later sweeps at the ends of the log, at its gaps and, with a
-    warning, at a sweep whose file is missing. A pair that cannot be read is a `CFlowError`.
+    warning, at a sweep whose file is missing or damaged. A pair that cannot be read is a `CFlowError`, and so is
+    another sweep that the file system does not give.
     """
     count = len(log.timestamps)
     if not 0 <= index < count - 1:
@@ -362,16 +365,23 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
 
 
 def _readable(log: Log, indices: range) -> Iterator[Sweep]:
-    """Yield the sweeps of a history or future, up to a gap of the log or a sweep whose file is missing."""
+    """Yield the sweeps of a history or future, up to a gap of the log or a sweep whose file is missing or damaged."""
     for index in indices:
         if (index if indices.step < 0 else index - 1) in log.gaps:
             return
         try:
             sweep = log.sweep(index)
-        except MissingFile as error:
+        except CFlowError as error:
+            if _may_pass(error):
+                raise
             warn(f"log {log.log_id}: windows near sweep {index} are shorter, because {error}")
             return
         yield sweep
+
+
+def _may_pass(error: BaseException | None) -> bool:
+    """Test whether the file system caused an error, such as a lost connection. Then the next run may read the sweep."""
+    return error is not None and (isinstance(error, OSError) or _may_pass(error.__cause__))
 
 
 def windows(log: Log, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
@@ -436,7 +446,7 @@ class _OfLog:
 for _name in (
     *("labels", "columns", "cameras", "poses", "trajectory", "readings", "judgement", "findings"),
     *("eval_mask", "stored_motion", "moving", "units", "boxes", "T_camera0_lidar", "sample_tokens"),
-    *("sweep_name", "frame_number", "sweep_times"),
+    *("sweep_name", "frame_number", "sweep_times", "has_estimated_poses"),
     *("notes", "_note", "close", "unwrapped"),
 ):
     setattr(LogWrapper, _name, _OfLog(_name))  # `__getattr__` is not asked for members that `Log` has

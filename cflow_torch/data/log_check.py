@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Callable, Iterable, Iterator, List
 
 import numpy as np
@@ -249,6 +249,10 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     if not judgement.best:
         text = f"{judgement.given:.2f} of the static structure is in place some sweeps later"
         return [Finding("ego motion", RIGHT, text + ("" if has_poses else ", without poses"), True)]
+    if log.has_estimated_poses:
+        fit = f"only {judgement.given:.2f} of the static structure is in place"
+        text = f"the poses that we estimated from the points do not fit well ({fit}): give measured poses, if any"
+        return [Finding("ego motion", WRONG, text, True)]
     name = judgement.best[0]
     if name == UNKNOWN:
         why = "there are no poses, but" if not has_poses else "the poses hardly move, but"
@@ -298,9 +302,10 @@ def _mask(log: _CheckedLog) -> list[Finding]:
     for index in known:
         problem = "" if log.frame[1] or log.tilt else mask_problem(log.sweep(index))
         if problem:
-            text = f"the mask of {_name_of(index)} is {problem}"
-            if log.unwrapped.sweep(index).is_ground is None:  # we made it
-                mask: Any = masks[index]
+            text = f"the mask of {_name_of(index)} is {problem}; data.find_ground=grid replaces it"
+            mask: Any = masks[index]
+            is_replaced = getattr(log, "wrong_masks", "")  # of `GroundSegmentedLog`
+            if log.unwrapped.sweep(index).is_ground is None or is_replaced:  # we made it
                 what = "other points than those of the ground" if as_numpy(mask).any() else "no ground"
                 text = f"we find {what} in {_name_of(index)}, which has some: {_OTHER_GROUND}"
             return [Finding("ground", WRONG, text, True)]
@@ -391,7 +396,8 @@ def _each_sweep(log: _CheckedLog) -> list[Finding]:
     """Read every sweep: find those that cannot be read, have few points, repeat the one before, or are misplaced."""
     log.sweep(0)  # its error is that of the log
     neighbours = Neighbours.of(log, range(len(log)))
-    return [*_unreadable(neighbours), *_small(neighbours), *_misplaced(log, neighbours)]
+    misplaced = _collect(log, [partial(_misplaced, neighbours=neighbours)])  # may need a sweep that cannot be read
+    return [*_unreadable(neighbours), *_small(neighbours), *misplaced]
 
 
 def _unreadable(neighbours: Neighbours) -> list[Finding]:

@@ -11,9 +11,10 @@ import numpy as np
 from cflow_torch.data.log import Log, known_poses, poses_beyond
 from cflow_torch.diagnosis.conventions import MARGIN, OFF, STILL, TIMES, WORLD
 from cflow_torch.diagnosis.inspection import repeats
+from cflow_torch.diagnosis.other_frame import motion_of
 from cflow_torch.diagnosis.pair import GIVEN, Pair, difference, make_pair
 from cflow_torch.diagnosis.readings import UNKNOWN, Judgement, judge
-from cflow_torch.diagnosis.stillness import LEAST_SHARE
+from cflow_torch.diagnosis.stillness import LEAST_SHARE, share_of_sweeps
 from cflow_torch.transforms import turn_of
 
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
@@ -23,13 +24,16 @@ _REACH = 10  # sweeps before and after a pair, whose poses may be those of the p
 _LEAST_SPEED, _LEAST_TIMED = 0.5, 0.1
 _UNCLEAR = 0.2  # share in place, below which poses that hardly move are compared with the motion of the sensor
 _LEAST_MOTION = 0.2  # metres between the sweeps of a pair, else the vehicle stands
-# A step between two poses is suspect if it differs from its neighbours' by this, as a length or as a part of theirs.
-_SUSPECT, _SUSPECT_SHARE = 0.2, 0.3
+# A step between two poses is suspect if it differs from its neighbours' by this, plus a part of theirs: then
+# the points decide. A step that differs by more is left out where readings of all poses are compared.
+_SUSPECT, _SUSPECT_SHARE = 0.15, 0.1
+_LEFT_OUT, _LEFT_OUT_SHARE = 0.2, 0.3
 _ARM = 10.0  # metres; a rotation counts as the motion of a point that far away
 _FEWEST_POSES = 5  # that tell a usual step
 _AROUND = (-3, -2, -1, 1, 2, 3)  # steps that tell it
 POSE, JUMP, MISSING = "pose", "jump", "missing"
 _OTHER = "another step"
+_AS_OTHERS = 0.75  # part of the share of the steps around, at least, under the right step
 _NUM_SUSPECTS = 4  # steps that are compared with the points, largest first
 _LONG = 1.7  # length of a step over all those around it, if sweeps are missing
 
@@ -123,8 +127,7 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     Cost: reads two sweeps per pair, and 0.1 s each.
     """
     poses = known_poses(log)
-    steps = steps_of(log)
-    jumps = () if steps is None else steps.suspects
+    jumps = _jumps(log)
     chosen = choose_pairs(len(log.timestamps), poses, jumps)
     make_pairs = partial(_make_pairs, log, poses, deskew)
     if log.surrounds_poses:
@@ -169,8 +172,7 @@ def fits_better(log: Log, others: np.ndarray) -> bool:
     poses = known_poses(log)
     if poses is None:
         return False
-    steps = steps_of(log)
-    chosen = _pairs_without_repeats(log, poses, () if steps is None else steps.suspects, ())
+    chosen = _pairs_without_repeats(log, poses, _jumps(log), ())
     prepared = []
     for first, second in chosen:
         pair = make_pair(log.sweep(first), log.sweep(second), in_world=False)
@@ -253,10 +255,9 @@ class Steps(NamedTuple):
     longest: np.ndarray  # (K-1,) metres, of the largest speed of the steps around it
     excess: np.ndarray  # (K-1,) metres by which a step differs, rotations at 10 m
 
-    @property
-    def suspects(self) -> list[int]:
-        """Indices of steps that differ much from those around them, up to four, largest first."""
-        limit = _SUSPECT + _SUSPECT_SHARE * np.linalg.norm(self.usual[:, :3, 3], axis=1)
+    def beyond(self, metres: float, share: float) -> list[int]:
+        """Return indices of steps that differ from those around them by more, up to four, largest first."""
+        limit = metres + share * np.linalg.norm(self.usual[:, :3, 3], axis=1)
         order = np.argsort(-self.excess, kind="stable")[:_NUM_SUSPECTS]
         return [int(k) for k in order if self.excess[k] > limit[k]]
 
@@ -279,39 +280,60 @@ def steps_of(log: Log) -> Steps | None:
     rates = np.where(is_step[..., None], rate[around], np.nan)
     usual[:, :3, 3] = np.nanmedian(rates, 1) * interval[:, None]
     longest = np.nanmax(np.linalg.norm(rates, axis=2), 1) * interval
-    excess = np.linalg.norm(steps[:, :3, 3] - usual[:, :3, 3], axis=1)
-    excess += _ARM * np.linalg.norm(steps[:, :2, 0] - usual[:, :2, 0], axis=1)
-    return Steps(steps, usual, longest, excess)
+    return Steps(steps, usual, longest, _apart(steps, usual))
+
+
+def _apart(step: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return by how much steps, (..., 4, 4), differ from others, (...,) metres, rotations about z at 10 m."""
+    shift, turn = (step - other)[..., :3, 3], (step - other)[..., :2, 0]
+    return np.linalg.norm(shift, axis=-1) + _ARM * np.linalg.norm(turn, axis=-1)  # type: ignore[no-any-return]
+
+
+def _jumps(log: Log) -> list[int]:
+    """Return indices of the steps between poses over which no pair of sweeps should reach."""
+    steps = steps_of(log)
+    return [] if steps is None else steps.beyond(_LEFT_OUT, _LEFT_OUT_SHARE)
 
 
 def find_lapses(log: Log) -> list[Lapse]:
     """Find wrong poses, jumps of the poses, and sweeps that are missing, in the order of the log.
 
     A step between neighbouring poses is suspect if it differs from the steps around it. We read the two sweeps of the
-    most suspect steps, and compare the points under the step and under that of the neighbours. In logs with times,
-    steps are in proportion to them. Give logs whose poses fit: another convention of poses changes steps, too.
+    most suspect steps, and compare the points under the step, under that of the neighbours, and under the motion that
+    fits them best, because the vehicle may speed up. In logs with times, steps are in proportion to them. Give logs
+    whose poses fit: another convention of poses changes steps, too.
     """
     steps = steps_of(log)
     if steps is None:
         return []
     lapses: list[Lapse] = []
-    for index in sorted(steps.suspects):
+    for index in sorted(steps.beyond(_SUSPECT, _SUSPECT_SHARE)):
         given, usual = steps.given[index], steps.usual[index]
         length = float(np.linalg.norm(given[:3, 3]))
         is_long = index not in log.gaps and length > _LONG * max(steps.longest[index], _LEAST_MOTION)
         pair = make_pair(log.sweep(index), log.sweep(index + 1), in_world=False)
         if pair is None:
             continue
-        if _is_contradicted(pair, given, usual):
+        fitting = usual if _is_contradicted(pair, given, usual) else motion_of(pair, OFF)
+        if _is_contradicted(pair, given, fitting) and _fits_as_others(log, index, pair, fitting):
             if lapses and lapses[-1].sweep == index and lapses[-1].kind == JUMP:
                 lapses[-1] = lapses[-1]._replace(kind=POSE)  # away from, and back to the trajectory
             else:
-                lapses.append(Lapse(index + 1, float(steps.excess[index]), JUMP))
+                lapses.append(Lapse(index + 1, float(_apart(given, fitting)), JUMP))
         elif is_long and _is_contradicted(pair, usual, given):
             lapses.append(Lapse(index + 1, length, MISSING))
     return lapses
 
 
 def _is_contradicted(pair: Pair, step: np.ndarray, other: np.ndarray) -> bool:
-    """Test whether the points fit better under another step."""
-    return bool(judge([replace(pair, transforms={GIVEN: step, _OTHER: other}, has_motion=True)]).best)
+    """Test whether the points fit clearly better under another step."""
+    judgement = judge([replace(pair, transforms={GIVEN: step, _OTHER: other}, has_motion=True)])
+    return bool(judgement.best) and judgement.shares[_OTHER] >= MARGIN * judgement.given
+
+
+def _fits_as_others(log: Log, index: int, pair: Pair, step: np.ndarray) -> bool:
+    """Test whether under a step, two sweeps fit about as well as those around them: raw sweeps may fit badly."""
+    around = [other for other in (index - 2, index + 2) if 0 <= other < len(log.timestamps) - 1]
+    others = [share_of_sweeps(log.sweep(other), log.sweep(other + 1)) for other in around]
+    share = replace(pair, transforms={GIVEN: step}).share(OFF)
+    return all(share >= _AS_OTHERS * other for other in others if np.isfinite(other))

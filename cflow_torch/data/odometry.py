@@ -17,7 +17,7 @@ from cflow_torch.transforms import relative_transform, rigid_transform
 from cflow_torch.types import Sweep
 
 _FEWEST_POINTS = 100
-_FARTHEST = (4.0, 1.0, 0.5)  # metres, of correspondences, one alignment after the other
+_FARTHEST = (4.0, 1.0, 0.5, 0.3)  # metres, of correspondences, one alignment after the other
 _MAX_RANGE = 100.0  # metres
 _VOXEL = 0.25  # metres, of the points that are aligned
 _NUM_NEIGHBOURS = 10  # of a point, from which its covariance comes
@@ -103,10 +103,11 @@ def estimate_poses(log: Log) -> np.ndarray:
 
 
 class PosedLog(LogWrapper):
-    """A log with other poses, (K, 4, 4) float64 `T_world_ego`, one per sweep."""
+    """A log with other poses, (K, 4, 4) float64 `T_world_ego`, one per sweep; `are_estimated` = by `estimate_poses`."""
 
-    def __init__(self, log: Log, poses: np.ndarray) -> None:
+    def __init__(self, log: Log, poses: np.ndarray, are_estimated: bool = False) -> None:
         super().__init__(log)
+        self.has_estimated_poses = are_estimated
         self.poses = self._given = poses
         self.trajectory = None
 
@@ -117,4 +118,4 @@ class PosedLog(LogWrapper):
 def with_poses(log: Log, refine: bool = False) -> Log:
     """Return a log with `estimate_poses`, or the log itself if its sweeps have poses that are not to be refined."""
     has_poses = log.sweep(0).pose is not None and (log.poses is None or known_poses(log) is not None)
-    return log if has_poses and not refine else PosedLog(log, estimate_poses(log))
+    return log if has_poses and not refine else PosedLog(log, estimate_poses(log), are_estimated=True)

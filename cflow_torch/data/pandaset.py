@@ -70,13 +70,16 @@ class PandaSetLog(Log):
         self.folder = as_path(folder)
         self.log_id = self.folder.resolve().name
         lidar = self.folder / "lidar"
-        named = {end: sorted(path for path in visible(lidar) if path.name.endswith(end)) for end in (".pkl.gz", ".pkl")}
-        self._files = named[".pkl.gz"] or named[".pkl"]
+        names = {path.name for path in visible(lidar)}
+        end = next((end for end in (".pkl.gz", ".pkl") if any(name.endswith(end) for name in names)), ".pkl.gz")
         seconds, self._poses = _times_and_poses(lidar)
         self.timestamps = [round(each * 1e9) for each in seconds]
         self._check_count(self.folder)
-        if not len(self._files) == len(self._poses) == len(self.timestamps):
-            counts = f"{len(self._files)} sweeps, {len(self._poses)} poses and {len(self.timestamps)} time stamps"
+        files = [f"{number:02d}{end}" for number in range(len(self._poses))]  # one may be missing
+        self._files = [lidar / name for name in files]
+        found = {name for name in names if name.endswith(end)}
+        if len(self._poses) != len(self.timestamps) or not found or not found <= set(files):
+            counts = f"{len(found)} sweeps, {len(self._poses)} poses and {len(self.timestamps)} time stamps"
             raise CFlowError(f"{lidar} has {counts}; copy it again")
 
     def sweep(self, index: int) -> Sweep:

@@ -12,7 +12,7 @@ _UNITS = (10**9, 10**6, 10**3, 1)  # nanoseconds in s, ms, us and ns
 # Seconds in which the middle half of the points is measured. The range is below a factor of 1000, so one unit fits.
 _SHORTEST_HALF, _LONGEST_HALF = 0.0015, 1.4
 _USUAL_PERIOD, _LONGEST_PERIOD = 0.1, 0.25  # seconds between sweeps; a log with more is thinned
-_LARGEST_LAG = 1.0  # seconds from the stamp of a sweep to its points; more means another clock
+_LARGEST_LAG = 1.5  # periods from the stamp of a sweep to its nearest point; more means another clock
 _REPEATED = 0.01  # a single time of more points than this share is a default value, if no other time has many points
 _MOST_STRAY = 0.2  # share of the points; with more, the column holds other numbers
 _LATEST = 2.0**64  # integers that fit; larger floats are no times in any unit
@@ -74,7 +74,8 @@ def seconds_after(
         - The unit is the one of s, ms, us and ns in which a sweep has a plausible duration. Floats that fill the range
           from 0 to 1 are shares of a sweep.
         - Times count from the stamp or, if that is clearly closer to the stamp, from the epoch of the stamp. If neither
-          is within a second of the stamp, the times have another clock. Then the first point is at the stamp.
+          is within one and a half periods of the stamp, the times have another clock. Then the first point is at the
+          stamp.
     """
     nothing = np.zeros(len(values), bool)
     missing = nothing if is_missing is None else is_missing
@@ -106,7 +107,9 @@ def seconds_after(
     reach = max(1.1 * min(period or _LONGEST_PERIOD, _LONGEST_PERIOD), 3e-9 * half * unit)
     is_stray |= ~(np.abs(seconds) <= reach)
     lag, note = _lag(centre, unit, stamp_ns or 0) * 1e-9, ""
-    if abs(lag) > _LARGEST_LAG:
+    farthest = _LARGEST_LAG * min(period or _LONGEST_PERIOD, _LONGEST_PERIOD)
+    is_before, is_after = lag + seconds[~is_stray].max() < -farthest, lag + seconds[~is_stray].min() > farthest
+    if is_before or is_after:
         if stamp_ns is not None:
             note = f"times of points have another clock than the sweeps ({lag:+.6g} s), so the first is at the stamp"
         lag = -float(seconds[~is_stray].min())

@@ -165,7 +165,11 @@ class ReadAs(LogWrapper):
     def _move(self, points: np.ndarray, index: int, pose: Any) -> np.ndarray:
         """Convert points of sweep `index`, (N, 3+), to metres in the frame of the vehicle."""
         if self.reading == WORLD:
-            return transform_points(points[:, :3], np.linalg.inv(self._given(index, pose)))
+            T_ego_points = np.linalg.inv(self._given(index, pose))
+            own: Any = self.log.unwrapped
+            if own.has_viewpoints:  # the reader took the points for those of the LiDAR
+                T_ego_points = T_ego_points @ np.linalg.inv(own.ego_T_lidar)
+            return transform_points(points[:, :3], T_ego_points)
         convert = READINGS[self.reading].of_points
         return points[:, :3] if convert is None else convert(points)
 

@@ -20,6 +20,7 @@ _WEAK, _UNSHOWN = 0.1, 0.15  # metres of no rotation, and of no place a metre aw
 _DIRECTIONS = (("ahead", "back"), ("left", "right"), ("up", "down"))
 _PLACES = 0.4 * np.array([(x, y) for x in range(-10, 11) for y in range(-10, 11) if x or y])  # metres, of the LiDAR
 _NUM_BEST = 30  # places that are compared by the most points
+_YAWS = np.radians([0, -2, 2, -4, 4])  # from the rotation of the motions, which in turns depends on the place
 _BETWEEN = 0.2 * np.array([(x, y) for x in range(-1, 2) for y in range(-1, 2)])
 # The search for an unknown motion correlates occupied cells of a square.
 _CELL, _CELLS = 0.1, 640  # metres, and cells along a side
@@ -59,7 +60,9 @@ def mounting(rotation: np.ndarray, place: np.ndarray) -> Reading:
     where = "data.ego_T_lidar with"
     yaw = float(np.arctan2(rotation[1, 0], rotation[0, 0]))
     tilt = turn_of(rotations_about(2, -yaw) @ rotation)
+    told = rotation
     if turn_of(rotation) > 0 and tilt < min(abs(yaw), _LEVEL):
+        told = rotations_about(2, yaw)
         degrees = np.degrees(yaw)
         side = "left" if degrees > 0 else "right"
         causes.append(f"the points' x axis points about {abs(degrees):.0f} degrees to the {side} of the poses'")
@@ -78,7 +81,8 @@ def mounting(rotation: np.ndarray, place: np.ndarray) -> Reading:
         named = [f"{axis} = {value:.1f} m" for axis, value in zip("xyz", place) if axis != "z" or abs(value) > 0.05]
         causes.append(f"the points' origin is at about {' and '.join(named)} in the frame of the poses")
         fixes.append(f"a position of about {' and '.join(named)}")
-    fix = f"{where} {' and '.join(fixes)} (data=arrays, hdf5 or bags)"
+    matrix = str((as_matrix(told, place).round(3) + 0.0).tolist()).replace(" ", "")
+    fix = f"{where} {' and '.join(fixes)}: data.ego_T_lidar={matrix} (data=arrays, hdf5 or bags)"
     return Reading(", and ".join(causes), partial(_seen_from, as_matrix(rotation, place)), fix=fix)
 
 
@@ -110,6 +114,21 @@ def place_of(pairs: Sequence[Pair], scan: str, rotation: np.ndarray) -> np.ndarr
         places = np.concatenate([origin, best[:_NUM_BEST] if len(best) > _NUM_BEST else best[0] + _BETWEEN])
     is_at_origin = turn_of(rotation) > 0 and shares[0] >= EQUAL * shares[1:].max()
     return np.zeros(3) if is_at_origin else rotation[:, :2] @ best[0]
+
+
+def mounting_of(pairs: Sequence[Pair], scan: str, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rotation of the points near a given one, (3, 3), and their place, (3,), that fit best together.
+
+    The place is 0, and the rotation as given, if that fits as well.
+    """
+    near = rotations_about(2, _YAWS) @ rotation
+    mounts = [(rotation, np.zeros(3)), *((turned, place_of(pairs, scan, turned)) for turned in near)]
+    ego_T_points = np.stack([as_matrix(*mount) for mount in mounts])
+    shares = np.zeros(len(mounts))
+    for pair in pairs:
+        steps = _seen_from(ego_T_points, pair.transforms[GIVEN])
+        shares += pair.target.structure(scan).shares(pair.source.points(scan)[:MOST_POINTS], steps)
+    return mounts[0 if shares[0] >= EQUAL * shares.max() else int(shares.argmax())]
 
 
 def motion_of(pair: Pair, scan: str) -> np.ndarray:

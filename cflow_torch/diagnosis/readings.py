@@ -28,7 +28,7 @@ from cflow_torch.diagnosis.conventions import (
     Reading,
     scaled,
 )
-from cflow_torch.diagnosis.other_frame import find_motion, motion_of, mounting, place_of, rotation_between
+from cflow_torch.diagnosis.other_frame import find_motion, motion_of, mounting, mounting_of, place_of, rotation_between
 from cflow_torch.diagnosis.pair import COMPARED, GIVEN, LEAST_MOTION, MOST_POINTS, Pair, difference
 from cflow_torch.diagnosis.stillness import LEAST_SHARE
 from cflow_torch.transforms import turn_of
@@ -228,7 +228,7 @@ def _readings_of_motions(pairs: Sequence[Pair], scan: str, motions: Sequence[np.
     is_turned = not np.array_equal(axes, np.eye(3))
     found = {}
     if turn_of(axes.T @ rotation) > _OBLIQUE or not np.array_equal(axes @ axes.T, np.eye(3)):
-        found[MOUNTED] = mounting(rotation, place_of(pairs, scan, rotation))
+        found[MOUNTED] = mounting(*mounting_of(pairs, scan, rotation))
     elif is_turned:
         rotation = axes if axes[2, 2] == 1 else rotation
         place = place_of(pairs, scan, rotation)

@@ -16,6 +16,7 @@ from tiny_recording import TinyRecording
 from cflow_torch import CFlowError
 from cflow_torch.data.bags import BagLog, find_bags
 from cflow_torch.data.bags.messages import cloud_columns, points_of
+from cflow_torch.data.bags.reader import _parts
 from cflow_torch.data.catalog import open_log, recognise
 from cflow_torch.transforms import as_matrix
 from cflow_torch.types import CFlowWarning
@@ -101,6 +102,18 @@ def test_parts_of_a_bag_are_joined(tmp_path) -> None:
     assert log.log_id == "drive" and len(log) == 8 and world(log, part.recording) < 5e-3
 
 
+def test_parts_are_joined_if_their_names_have_their_times(tmp_path) -> None:
+    """As rosbag record --split names them; two recordings follow each other, and two others ran at a time."""
+    drive = [f"2024-01-05-10-0{minute}-00_{number}.bag" for minute, number in enumerate((0, 1, 2, 0, 1))]
+    mixed = [f"run_2024-01-05-10-0{minute}-00_{number}.bag" for minute, number in enumerate((0, 0, 1, 1))]
+    for name in (*drive, *mixed):
+        (tmp_path / name).touch()
+    found = [path.name for path in find_bags(tmp_path)]
+    assert found == [drive[0], drive[3], *mixed]
+    assert [path.name for path in _parts(tmp_path / drive[0])] == drive[:3]
+    assert [path.name for path in _parts(tmp_path / drive[3])] == drive[3:]
+
+
 def test_folders_without_or_with_old_metadata_are_read(tmp_path) -> None:
     folder = write_bag(tmp_path, "ros2", TinyRecording(("velodyne",), num_sweeps=3))
     (file,) = folder.glob("*.db3")
@@ -130,6 +143,42 @@ def test_a_missing_link_is_named(tmp_path) -> None:
     assert np.allclose(assumed.poses[3], bag.recording.pose_at(assumed.timestamps[3]))
     log = BagLog(path, ego_T_lidar=MOUNT)
     assert log.frame == "base_link" and world(log, bag.recording) < 5e-3
+
+
+def test_a_bag_next_to_one_without_poses_is_named_if_it_has_some(tmp_path, recwarn) -> None:
+    """Clouds and transforms were recorded into two bags; a third one is of another time."""
+    bag = Recorder(tmp_path / "clouds")
+    bag.clouds()
+    clouds = bag.close().rename(tmp_path / "lidar.bag")
+    for name, start, end in (("later", 900, 901), ("poses", -2, 20)):
+        bag = Recorder(tmp_path / name)
+        bag.mount() if name == "poses" else None
+        bag.drive(start, end)
+        bag.close().rename(tmp_path / f"{name}.bag")
+    (note,) = BagLog(clouds).notes
+    assert note.startswith("poses.bag next to it has /tf of the same time, which we do not read: merge both by ")
+    assert note.endswith("rosbags-convert --src lidar.bag poses.bag --dst merged")
+
+
+def test_transforms_connect_frames_in_either_direction(tmp_path) -> None:
+    """The vehicle below its LiDAR, and the frame of the world below the vehicle, as KISS-ICP publishes it."""
+    mounted = Recorder(tmp_path / "mount")
+    mounted.transform(mounted.stamps[0], "velodyne", "base_link", np.linalg.inv(MOUNT))
+    mounted.drive()
+    mounted.clouds()
+    log = BagLog(mounted.close())
+    assert log.frame == "base_link" and world(log, mounted.recording) < 5e-3 and not log.notes
+    for name, vehicle in (("vehicle", "base_link"), ("lidar", "velodyne")):
+        bag = Recorder(tmp_path / name)
+        bag.mount()
+        for stamp in range(bag.stamps[0] - 10**8, bag.stamps[-1] + 10**8, STEP):
+            T = bag.recording.pose_at(stamp) @ (MOUNT if vehicle == "velodyne" else np.eye(4))
+            bag.transform(stamp, vehicle, "odom_lidar", np.linalg.inv(T))
+        bag.clouds()
+        path = bag.close()
+        with pytest.warns(CFlowWarning, match=f"from {vehicle} to odom_lidar, so we invert them"):
+            log = BagLog(path)
+        assert log.frame == "base_link" and world(log, bag.recording) < 5e-3
 
 
 def test_an_odometry_of_a_frame_below_the_lidar_is_connected(tmp_path, recwarn) -> None:

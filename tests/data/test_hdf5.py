@@ -269,11 +269,27 @@ def test_argoverse_scenes_without_extrinsics_are_recognised(drive, tmp_path):
         HDF5Log(file, ego_T_lidar=np.ones((4, 4)))
 
 
+def test_points_in_a_map_keep_their_precision_and_fillers_are_missing(tmp_path):
+    """Float64 coordinates in UTM, of which float32 has steps of 0.5 m, and drivers' 1e10 for shots without a return."""
+    rng, far = np.random.default_rng(0), np.array((6.9e5, 5.3e6, 500))
+    points = rng.uniform(-60, 60, (50, 3))
+    points[7:19] = 1e10
+    is_filler = points[:, 0] == 1e10
+    near = write_scene(tmp_path / "near.h5", lidar=points)
+    in_map = write_scene(tmp_path / "map.h5", lidar=np.where(is_filler[:, None], points, points + far))
+    for file, moved, dtype in ((near, 0, np.float32), (in_map, far, np.float64)):
+        read = HDF5Log(file).sweep(0).points
+        assert read.dtype == dtype and np.isnan(read[is_filler]).all()
+        assert np.allclose((read - moved)[~is_filler], points[~is_filler], atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("name", "stamps", "has_times"),
     [
         ("{:06d}", [0, 1, 2], False),
         ("1700000000.{}", [1_700_000_000_000_000_000 + k * 10**8 for k in range(3)], True),
+        ("1700000000_{}00000000", [1_700_000_000_000_000_000 + k * 10**8 for k in range(3)], True),
+        ("frame_{}", [0, 1, 2], False),
     ],
 )
 def test_groups_may_be_numbered_or_called_by_seconds(tmp_path, name, stamps, has_times):

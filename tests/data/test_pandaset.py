@@ -163,6 +163,19 @@ def test_files_without_compression_are_read(sequence: Path) -> None:
     assert np.array_equal(log.labels(0).flow, flow)
 
 
+def test_a_missing_sweep_costs_only_its_pairs(sequence: Path) -> None:
+    before = PandaSetLog(sequence).sweep(2)
+    (sequence / "lidar" / "01.pkl.gz").rename(sequence / "lidar" / "03.pkl.gz")
+    with pytest.raises(CFlowError, match="has 3 sweeps, 3 poses and 3 time stamps"):
+        PandaSetLog(sequence)
+    (sequence / "lidar" / "03.pkl.gz").unlink()
+    log = PandaSetLog(sequence)
+    assert len(log) == 3 and np.array_equal(log.sweep(2).points, before.points)
+    assert np.array_equal(log.sweep(2).pose, before.pose)
+    with pytest.raises(CFlowError, match=r"01.pkl.gz is missing"):
+        log.sweep(1)
+
+
 def test_cameras_have_the_poses_of_their_images(sequence: Path) -> None:
     """The camera is 1 m above the vehicle, looks ahead, and takes its image 20 ms after the sweep."""
     assert PandaSetLog(sequence).cameras(0) == []

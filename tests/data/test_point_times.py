@@ -35,6 +35,9 @@ NS = np.round(SHARES * 1e8).astype(np.int64)
         (SHARES.astype(np.float32), 0.0, True),
         (7e17 + SHARES * 1e8, 0.0, True),  # Livox without a common clock
         (STAMP * 1e-9 + 37 + SHARES * 0.1, 0.0, True),  # TAI
+        (0.3 + SHARES * 0.1, 0.0, True),  # a sensor that has just started
+        ((NS + 300_000_000).astype(np.int64), 0.0, True),
+        (STAMP * 1e-9 - 0.24 + SHARES * 0.1, -0.24, False),  # stamps of arrival, 0.14 s after the last point
     ],
 )
 def test_the_unit_and_origin_of_times_are_recognised(values: Any, first: float, is_assumed: bool) -> None:

@@ -424,6 +424,16 @@ def test_a_lidar_that_is_turned_and_elsewhere_is_located(turning):
     assert found and np.hypot(float(found[1]) - 2, float(found[2])) < 0.5
 
 
+def test_a_rotation_and_a_place_that_fit_only_together_are_one_matrix(real):
+    """The rotation alone would be 27 degrees, under which some sweeps do not fit."""
+    ego_T_lidar = as_matrix(rotations_about(2, np.radians(30)), (1, 0.2, 0))
+    mixed = Wrong(real, points=lambda points, _: transform_points(points, np.linalg.inv(ego_T_lidar)), masks=False)
+    problem = next(text for text in find_problems(mixed) if "ego_T_lidar" in text)
+    matrix = np.array(json.loads(re.search(r"data.ego_T_lidar=(\[\[\S*\]\])", problem)[1]))
+    assert np.degrees(turn_of(matrix[:3, :3].T @ ego_T_lidar[:3, :3])) < 1.5
+    assert np.hypot(*(matrix - ego_T_lidar)[:2, 3]) < 0.4
+
+
 @pytest.mark.parametrize(
     ("source", "degrees"),
     [
@@ -665,7 +675,16 @@ def test_single_poses_that_are_off_are_found(drive):
         poses[7:, 1, 3] += 1.5
         return poses
 
-    for change, index, kind in ((glitch, 6, POSE), (turned, 6, POSE), (jump, 7, JUMP)):
+    def small(index):
+        def change(poses):
+            poses = poses.copy()
+            poses[index, 0, 3] += 0.3
+            return poses
+
+        return change
+
+    ends = (small(0), 1, JUMP), (small(11), 11, JUMP)
+    for change, index, kind in ((glitch, 6, POSE), (turned, 6, POSE), (jump, 7, JUMP), (small(5), 5, POSE), *ends):
         (lapse,) = find_lapses(Wrong(drive, poses=change))
         assert (lapse.sweep, lapse.kind) == (index, kind)
     assert "jump by 1.5 m before sweep 7" in find_problems(Wrong(drive, poses=jump))[0]
@@ -838,6 +857,17 @@ def test_sweeps_of_half_a_view_are_told_once(whole):
 
     wrong = [finding.text for finding in examine(Half(whole)) if finding.status == WRONG]
     assert len(wrong) == 1 and re.search("share [1-5]?[0-9] % of the directions", wrong[0])
+
+
+def test_a_chosen_method_replaces_wrong_masks_only(drive):
+    inverted = Wrong(drive, masks=np.logical_not)
+    chosen = GroundSegmentedLog(inverted, "grid")
+    (text,) = find_problems(chosen)
+    assert text == "a mask of the log is not that of points that lie low, so find_ground=grid replaces all masks"
+    assert (chosen.sweep(3).is_ground == drive.sweep(3).is_ground).mean() > 0.9
+    assert "data.find_ground=grid replaces it" in find_problems(inverted)[0]
+    assert np.array_equal(GroundSegmentedLog(inverted, "auto").sweep(3).is_ground, inverted.sweep(3).is_ground)
+    assert np.array_equal(GroundSegmentedLog(drive, "grid").sweep(3).is_ground, drive.sweep(3).is_ground)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.6])
@@ -1018,14 +1048,14 @@ def test_the_page_says_what_was_found(drive):
 def test_the_page_counts_sweeps_that_cannot_be_read(drive):
     class Damaged(Wrong):
         def sweep(self, index):
-            if index in (7, 8):
+            if index in lost:
                 raise MissingFile(f"sweep {index} does not exist")
             return super().sweep(index)
 
-    texts = [one.text for one in examine(Damaged(drive)) if one.status == WRONG]
-    assert texts == [
-        "2 of 12 sweeps cannot be read, the first is sweep 7: sweep 7 does not exist. Their pairs have no flow"
-    ]
+    for lost in ((7, 8), (2, 5, 9)):
+        texts = [one.text for one in examine(Damaged(drive)) if one.status == WRONG and one.topic == "sweeps"]
+        first = f"the first is sweep {lost[0]}: sweep {lost[0]} does not exist"
+        assert texts == [f"{len(lost)} of 12 sweeps cannot be read, {first}. Their pairs have no flow"]
 
 
 def test_the_page_names_sweeps_with_few_points(whole):

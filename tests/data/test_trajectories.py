@@ -215,6 +215,13 @@ def test_a_missing_sweep_shortens_windows_and_fails_its_pairs(tmp_path) -> None:
         found = window(log, 7, 4)
     assert [sweep.points[0, 0] for sweep in found.pch] == [7] and isinstance(found.pc0, Sweep)
     assert len(window(log, 1, 4, 4).pcf) == 2 and len(window(log, 10, 4).pch) == 4
+    (tmp_path / f"{STAMPS[5]}.npy").write_bytes((tmp_path / "5.moved").read_bytes()[:100])
+    with pytest.warns(CFlowWarning, match="windows near sweep 5 are shorter, because .* truncated or damaged"):
+        assert len(window(log, 7, 4).pch) == 1
+    (tmp_path / f"{STAMPS[5]}.npy").unlink()
+    (tmp_path / f"{STAMPS[5]}.npy").mkdir()
+    with pytest.raises(CFlowError, match=str(STAMPS[5])):  # of the file system, so that the next run may read it
+        window(log, 7, 4)
 
 
 def test_a_vehicle_that_stands_has_a_pose_in_every_line(tmp_path: Path) -> None:
@@ -244,6 +251,8 @@ LAYOUTS = {
     "trajectory of Open3D": [line for k, pose in enumerate(POSES) for line in (f"{k} {k} {k + 1}", *rows(pose))],
     "time and angles": rows([(k, *POSES[k, :3, 3], *ANGLES[k]) for k in range(12)], ","),
     "angles": rows([(*POSES[k, :3, 3], *ANGLES[k]) for k in range(12)]),
+    "quaternion x y z w first": rows([(*q[1:], q[0], *pose[:3, 3]) for q, pose in zip(QUATERNIONS, POSES)]),
+    "time, quaternion w first": rows([(k, *QUATERNIONS[k], *POSES[k, :3, 3]) for k in range(12)]),
     "vertices of g2o": [
         *(
             f"VERTEX_SE3:QUAT {k} {rows([[*POSES[k, :3, 3], *QUATERNIONS[k][1:], QUATERNIONS[k][0]]])[0]}"
@@ -271,6 +280,7 @@ def test_layouts_of_poses(tmp_path, layout) -> None:
         "radians",
         "time, by columns",
         "time and angles",
+        "time, quaternion w first",
         "four lines with a time",
     )
     assert (read.times_ns is not None) == has_times and (not has_times or read.times_ns[2] == 2 * 10**9)

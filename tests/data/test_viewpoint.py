@@ -10,17 +10,22 @@ from cflow_torch import CFlowError
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import read_cloud, write_cloud
 from cflow_torch.data.catalog import open_log
-from cflow_torch.transforms import to_quaternions, transform_points
+from cflow_torch.data.read_as import ReadAs
+from cflow_torch.transforms import as_matrix, rotations_about, to_quaternions, transform_points
 from cflow_torch.types import CFlowWarning
 
 pytest.importorskip("pypcd4", reason="needs the extra clouds: pip install pypcd4")
 
 
 THIN = slice(None, None, 3)  # rows of a sweep that are written
+IN_PLACE = np.eye(4)
 
 
-def write_drive(root, frame: str, origin: float):
-    """Write a third of the demo drive, and return it with its poses, of which the first is at x = `origin`."""
+def write_drive(root, frame: str, origin: float, mount=IN_PLACE):
+    """Write a third of the demo drive, and return it with its poses, of which the first is at x = `origin`.
+
+    VIEWPOINT is the pose of a LiDAR, `mount` its place on the vehicle.
+    """
     drive = make_small_drive(4, seed=1)
     to_start = np.linalg.inv(drive.poses[0])
     to_start[0, 3] += origin
@@ -28,8 +33,9 @@ def write_drive(root, frame: str, origin: float):
     for k, pose in enumerate(poses):
         sweep = drive.sweep(k)
         points = sweep.points[THIN]
-        points = points if frame == "sensor" else transform_points(points, pose).astype(np.float32)
-        viewpoint = (*pose[:3, 3], *to_quaternions(pose[None, :3, :3])[0])
+        points = transform_points(points, np.linalg.inv(mount) if frame == "sensor" else pose).astype(np.float32)
+        lidar = pose @ mount
+        viewpoint = (*lidar[:3, 3], *to_quaternions(lidar[None, :3, :3])[0])
         write_cloud(root / f"{k}.pcd", points, viewpoint=viewpoint)
     return drive, poses
 
@@ -52,6 +58,19 @@ def test_poses_are_read_and_the_frame_is_found(tmp_path, frame: str, origin: flo
     other = open_log("arrays", tmp_path, read_as=None if frame == "world" else "world", check=False)
     assert np.abs(other.sweep(3).points - drive.sweep(3).points[THIN]).max() > 1
     assert ArraysLog(tmp_path, poses=None).poses is None
+
+
+@pytest.mark.parametrize(("frame", "origin"), [("sensor", 0), ("world", 300)])
+def test_viewpoints_are_poses_of_the_lidar(tmp_path, frame: str, origin: float) -> None:
+    mount = as_matrix(rotations_about(0, np.radians(25)), (1, 0.5, 1.8))
+    drive, poses = write_drive(tmp_path, frame, origin, mount)
+    log = ArraysLog(tmp_path, ego_T_lidar=mount)
+    log = log if frame == "sensor" else ReadAs(log, "world")
+    for k in range(4):
+        assert np.allclose(log.sweep(k).pose, poses[k], atol=1e-6)
+        assert np.allclose(log.sweep(k).points, drive.sweep(k).points[THIN], atol=1e-3)
+    given = ArraysLog(tmp_path, ego_T_lidar=mount, poses_of="ego")
+    assert np.allclose(given.poses, poses @ mount, atol=1e-6)
 
 
 @pytest.mark.parametrize("frame", [pytest.param("sensor", marks=pytest.mark.slow), "world"])

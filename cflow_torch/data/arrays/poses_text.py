@@ -36,6 +36,7 @@ _UNNAMED = {
     17: ("time", *MATRIX),
 }
 """What columns without names hold, by their number."""
+_QUATERNION_FIRST = ("q0", "q1", "q2", "q3", *_POSITION)  # 7 numbers, or 8 with the time, whose last four are none
 _UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four are not a quaternion; 6 have no time
 STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz", ".npy")
 """Suffixes of files that must be whole to be read, see `tables_of_values`."""
@@ -50,12 +51,13 @@ def read_poses(path: PathLike) -> Trajectory:
         path: a file of text, of `STRUCTURED`, or `.npy` with (K, 4, 4), (K, 3, 4) or the numbers of K lines; or a
             folder with a file per pose. A line of text has 12 numbers (KITTI: upper three rows of the matrix), 8 (TUM:
             time in seconds, tx ty tz, qx qy qz qw, the scalar LAST), 7 (without the time), 16 (the matrix by rows, or
-            by columns), 13 or 17 (a time before the matrix), or 9 (the number of the row before TUM). 7 numbers without
-            a quaternion are a time, x y z, roll pitch yaw; 6 have no time. Four lines may have a matrix, below a line
-            of three numbers (Open3D). The last number of matrices may be a time in place of 1. Of a g2o graph, vertices
-            are read. If a line before the numbers names the columns (timestamp, x, qw, ...), they may have any order,
-            and roll, pitch and yaw may replace the quaternion. Other columns, empty lines and comments (`COMMENTS`) are
-            ignored. Times: `nanoseconds_of_numbers`.
+            by columns), 13 or 17 (a time before the matrix), or 9 (the number of the row before TUM). In 7 and 8, the
+            quaternion may come before x y z. 7 numbers without a quaternion are a time, x y z, roll pitch yaw; 6 have
+            no time. Four lines may have a matrix, below a line of three numbers (Open3D). The last number of matrices
+            may be a time in place of 1. Of a g2o graph, vertices are read. If a line before the numbers names the
+            columns (timestamp, x, qw, ...), they may have any order, and roll, pitch and yaw may replace the
+            quaternion. Other columns, empty lines and comments (`COMMENTS`) are ignored. Times:
+            `nanoseconds_of_numbers`.
 
     Convention: yaw turns x to y, pitch then z to x, roll then y to z. What is not named of z, roll and pitch is 0. The
         angles are degrees if their name says so, or one is larger than 2 pi, else radians. A quaternion q0 to q3 has w
@@ -110,8 +112,11 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
     unnamed = _UNNAMED.get(words.shape[1], ())
     if unnamed == MATRIX and not (words[:, 15].astype(np.float64) == 1).all() and _are_homogeneous(words[:, 12:]):
         unnamed = (*MATRIX[:12], *["row"] * 3, "time")
-    if words.shape[1] in (6, 7) and not names and not _end_in_quaternions(words):
-        unnamed = _UNNAMED_ANGLES[7 - words.shape[1] :]
+    if words.shape[1] in (6, 7, 8) and not names and not _are_quaternions(words[:, -4:]):
+        if words.shape[1] > 6 and _are_quaternions(words[:, -7:-3]):
+            unnamed = ("time", *_QUATERNION_FIRST)[8 - words.shape[1] :]
+        elif words.shape[1] < 8:
+            unnamed = _UNNAMED_ANGLES[7 - words.shape[1] :]
     if unnamed[:1] == ("row",) and not (np.diff(words[:, 0].astype(np.float64)) == 1).all():
         unnamed = ()  # the first of 9 numbers must count the rows
     if not roles and (not names or len(unnamed) > 9 or len(names) == len(_TUM)):
@@ -150,8 +155,8 @@ def _are_homogeneous(rows: np.ndarray) -> bool:
     return not numbers[:, :3].any() and bool((last == 1).all() or (np.diff(last) > 0).all())
 
 
-def _end_in_quaternions(words: np.ndarray) -> bool:
-    norms = np.linalg.norm(words[:, -4:].astype(np.float64), axis=1)
+def _are_quaternions(words: np.ndarray) -> bool:
+    norms = np.linalg.norm(words.astype(np.float64), axis=1)
     return bool(np.nanmedian(np.abs(norms - 1)) < 0.1)
 
 

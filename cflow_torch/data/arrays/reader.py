@@ -55,8 +55,8 @@ class ArraysLog(Log):
             in a folder near this one that has poses at the unix times of the sweeps; None = no poses; or a file (see
             `read_poses`); or a (K, 4, 4) array.
         poses_of: whose poses these are: "ego", "lidar", or "sensor" = of another sensor. Then `ego_T_lidar` maps to
-            this sensor, the ego frame is the LiDAR's, and the points stay. "auto" = of the LiDAR if `ego_T_lidar` is
-            given and the static world then stands still clearly better, else "ego".
+            this sensor, the ego frame is the LiDAR's, and the points stay. "auto" = of the LiDAR if they come from
+            VIEWPOINT, or if `ego_T_lidar` is given and the static world then stands still clearly better, else "ego".
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
         times: "auto" = times.txt in the folder, or see `timestamps`; None = none; or a file with one time per sweep.
@@ -113,6 +113,8 @@ class ArraysLog(Log):
         mounting = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         stamps, table = self._known_times(times)
         trajectory, whose = self._trajectory(poses, poses_of, calibration, stamps)
+        self.has_viewpoints = trajectory is not None and trajectory.source == _VIEWPOINT
+        whose = "lidar" if whose == "auto" and self.has_viewpoints else whose
         self.ego_T_lidar = np.eye(4) if whose == "sensor" else mounting
         self.lidar_position = self.ego_T_lidar[:3, 3]
         if trajectory is not None and (stamps is None or table is not None):
@@ -125,7 +127,6 @@ class ArraysLog(Log):
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
         self.poses = None if trajectory is None else self._pose_per_sweep(_of_ego(trajectory, whose, mounting), stamps)
         self.gaps |= frozenset(self._gaps_in_numbers())
-        self.has_viewpoints = trajectory is not None and trajectory.source == _VIEWPOINT
         self._note(f"its poses come from {_VIEWPOINT}" if self.has_viewpoints else "")
         if whose == "auto" and ego_T_lidar is not None and self.poses is not None:
             self._ask_whose_poses()

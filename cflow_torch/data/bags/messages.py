@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any, Tuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from cflow_torch.windows.returns import missing_returns
 
 _CONSTANT = 1e-9  # metres, and entries of a rotation: the change of a constant transform by rounding
 BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up
+_WORLD = re.compile("(.*[/_])?(odom|odometry|map|world|earth)(_.*)?")  # the frames of REP 105, also of one program
 _SLIGHTLY_TILTED = 0.004  # 1 - cosine of 5 degrees
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype
 
@@ -66,8 +68,15 @@ class Frames:
     """A tree of coordinate frames: the parent of each frame, and samples of its `T_parent_frame` over time.
 
     `samples` are those of each parent and frame. Of several parents of a frame, we take the one with the most samples.
-    Ties: the last.
+    Ties: the last. A transform connects two frames in either direction: another constant one is inverted if its parent
+    is not in the tree, and all transforms between the root and a frame of the world that moves in the vehicle (as
+    KISS-ICP publishes it) are inverted, so that the world is the root.
+
+    Attributes:
+        inverted_world: the root if its transforms are inverted, and the frame in which it moved; () = none are.
     """
+
+    inverted_world: tuple[str, ...] = ()
 
     def __init__(self, samples: dict[tuple[str, str], list[Sample]]) -> None:
         by_count = sorted(samples, key=lambda link: len(samples[link]))
@@ -75,13 +84,40 @@ class Frames:
         self._ignored = [(parent, child) for parent, child in by_count if self._parents[child] != parent]
         self._samples = {child: samples[parent, child] for child, parent in self._parents.items()}
         self._links: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self._inverted: set[str] = set()  # frames whose samples are those of their `T_frame_parent`
+        for parent, child in [*self._ignored]:
+            rows = samples[parent, child]
+            if parent not in self._parents and parent not in self.chain(child) and _is_fixed(rows):
+                self._ignored.remove((parent, child))
+                self._invert(parent, child, rows)
+        for frame in sorted(filter(_WORLD.fullmatch, self._parents)):
+            above = self.chain(frame)[1:]
+            if self.is_moving(frame) and not any(_WORLD.fullmatch(each) or self.is_moving(each) for each in above):
+                self._make_root(frame)
+                self.inverted_world = frame, above[0]
+
+    def _invert(self, parent: str, child: str, samples: list[Sample]) -> None:
+        """Let the parent of a transform be the child of its child."""
+        self._parents[parent] = child
+        self._samples[parent] = samples
+        self._inverted.add(parent)
+
+    def _make_root(self, root: str) -> None:
+        """Invert all transforms between a frame and the root."""
+        chain = self.chain(root)
+        for child, parent in [*zip(chain, chain[1:])][::-1]:
+            del self._parents[child]
+            self._invert(parent, child, self._samples.pop(child))
+            if child in self._inverted:  # its samples are those of the other direction
+                self._inverted -= {child, parent}
+        self._links.clear()
 
     def _link(self, child: str) -> tuple[np.ndarray, np.ndarray]:
         """Return the times and poses of the transform to a frame; one of each if all its samples are equal."""
         if child not in self._links:
             rows = self._samples[child]
-            is_fixed = len({row[1:] for row in rows}) == 1
-            self._links[child] = sorted_poses(rows[:1] if is_fixed else rows, f"the transform to {child}")
+            times, poses = sorted_poses(rows[:1] if _is_fixed(rows) else rows, f"the transform to {child}")
+            self._links[child] = times, np.linalg.inv(poses) if child in self._inverted else poses
         return self._links[child]
 
     def chain(self, frame: str) -> list[str]:
@@ -166,6 +202,10 @@ class Frames:
             known = shortened(", ".join(sorted({*self._parents, *self._parents.values()})))
             raise CFlowError(f"no transforms connect {source} to {target}; the frames are {known or 'none'}")
         return np.linalg.inv(self.in_root(target, times_ns)) @ self.in_root(source, times_ns)
+
+
+def _is_fixed(samples: list[Sample]) -> bool:
+    return len({row[1:] for row in samples}) == 1
 
 
 def sample(time_ns: int, position: Any, rotation: Any) -> Sample:

@@ -26,6 +26,7 @@ from cflow_torch.types import Sweep
 SUFFIXES = (".bag", ".mcap", ".db3")
 _ACTIVE = ".active"  # of a recording that was not finished
 _PART = re.compile("(.+)_([0-9]+)")  # recorders number the parts of a bag from 0
+_START = re.compile("[0-9]{4}(-[0-9]{2}){5}")  # of a part, in names by rosbag record --split
 SEARCH_DEPTH = 3
 _CLOUD = "sensor_msgs/msg/PointCloud2"
 _LIVOX = tuple(f"{name}/msg/CustomMsg" for name in ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces"))
@@ -48,6 +49,8 @@ _REPAIR = "a recording that was cut off is repaired by rosbag reindex (.bag), mc
 _POSE_TYPES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/Pose{name}Stamped" for name in ("", "WithCovariance")))
 _OTHER_POSES = ("nav_msgs/msg/Path", "geometry_msgs/msg/TransformStamped")  # used if there are no others
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_MOVING = (*_TF_TYPES, *_POSE_TYPES)
+_MOST_OTHERS = 10  # bags next to one without poses, in which we look for some
 _ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by less
 _LARGEST_DELAY = 500_000_000  # nanoseconds by which messages arrive later than others
 _EARLY = 100_000_000  # nanoseconds; a message that arrives so long before its time has another clock than the recorder
@@ -61,7 +64,8 @@ def find_bags(root: PathLike) -> list[Path]:
     """Find all bags in a folder, at most three levels down, sorted; or return the given bag.
 
     Bags are files `.bag` (ROS 1), `.mcap`, `.db3`, and folders with a metadata.yaml (ROS 2). Files drive_0.bag,
-    drive_1.bag, ... are the parts of one bag. It is called by its first part, and `BagLog` opens them all.
+    drive_1.bag, ... are the parts of one bag, also if the time of each part is in its name. The bag is called by its
+    first part, and `BagLog` opens them all.
     """
     root = as_path(root)
     if root.is_file():
@@ -166,7 +170,31 @@ class BagLog(Log):
             return Trajectory(matrices, times, False, f"{source} of {self.path}")
         if poses is None:
             return None
-        return find_poses_near(self.path.parent, self.log_id, self.timestamps, self._is_covered_by, self._note)
+        near = find_poses_near(self.path.parent, self.log_id, self.timestamps, self._is_covered_by, self._note)
+        if near is None:
+            self._note(self._other_bag_with_poses())
+        return near
+
+    def _other_bag_with_poses(self) -> str:
+        """Name a bag next to this one that has poses of the same time; "" = there is none."""
+        arrived = [arrival for arrival, _ in self._clouds.values()]
+        parent = self.path.resolve().parent
+        folders = [parent, *(path for path in visible(parent) if path.is_dir())]
+        bags = [bag for folder in folders for bag in _bags_in(folder) if not bag.samefile(self.path)]
+        for bag in sorted(bags)[:_MOST_OTHERS]:
+            try:
+                reader = self._open(_parts(bag))
+            except Exception:  # of any library, about a file that nobody asked for
+                continue
+            kinds = {each.topic: each.msgtype for each in reader.connections}
+            is_late, is_early = reader.start_time > max(arrived), reader.end_time < min(arrived)
+            reader.close()
+            moving = sorted(topic for topic, kind in kinds.items() if kind in _MOVING and topic != "/tf_static")
+            if moving and not (is_late or is_early):
+                other = bag.relative_to(parent)
+                what = f"{other} next to it has {', '.join(moving)} of the same time, which we do not read"
+                return f"{what}: merge both by rosbags-convert --src {self.path.name} {other} --dst merged"
+        return ""
 
     def _is_covered_by(self, trajectory: Trajectory) -> bool:
         return trajectory.covers(self.timestamps)
@@ -209,20 +237,24 @@ class BagLog(Log):
     def _reader(self) -> Any:
         """Return the open bag. Each process opens it itself, also after a fork or unpickling."""
         if self._opened[0] != os.getpid():
-            rosbags, types = (import_optional(f"rosbags.{name}", _NEED) for name in ("highlevel", "typesys"))
-            for path in self._files:
-                for file in [path] if path.is_file() else path.iterdir():
-                    check_file(file)
-            _check_version(self._files)
-            # Bags of ROS 2 before Iron do not describe their messages. The types that we read never changed.
-            types_of_old_bags = types.get_typestore(types.Stores.ROS2_HUMBLE)
-            for name in _LIVOX:
-                for kind, definition in (("CustomPoint", _CUSTOM_POINT), ("CustomMsg", _CUSTOM_MSG)):
-                    types_of_old_bags.register(types.get_types_from_msg(definition, name.replace("CustomMsg", kind)))
-            reader = rosbags.AnyReader(self._files, default_typestore=types_of_old_bags)
-            reader.open()
-            self._opened = (os.getpid(), reader)
+            self._opened = (os.getpid(), self._open(self._files))
         return self._opened[1]
+
+    def _open(self, files: list[Path]) -> Any:
+        """Open files as one bag."""
+        rosbags, types = (import_optional(f"rosbags.{name}", _NEED) for name in ("highlevel", "typesys"))
+        for path in files:
+            for file in [path] if path.is_file() else path.iterdir():
+                check_file(file)
+        _check_version(files)
+        # Bags of ROS 2 before Iron do not describe their messages. The types that we read never changed.
+        types_of_old_bags = types.get_typestore(types.Stores.ROS2_HUMBLE)
+        for name in _LIVOX:
+            for kind, definition in (("CustomPoint", _CUSTOM_POINT), ("CustomMsg", _CUSTOM_MSG)):
+                types_of_old_bags.register(types.get_types_from_msg(definition, name.replace("CustomMsg", kind)))
+        reader = rosbags.AnyReader(files, default_typestore=types_of_old_bags)
+        reader.open()
+        return reader
 
     def close(self) -> None:
         """Close the bag. A sweep that is read later opens it again."""
@@ -312,6 +344,9 @@ class BagLog(Log):
         self._note(
             f"frames have several parents: we ignore the transforms that are rarer, {ignored}" if ignored else ""
         )
+        if self._frames.inverted_world:
+            world, vehicle = self._frames.inverted_world
+            self._note(f"its transforms are those from {vehicle} to {world}, so we invert them to get poses in {world}")
         return self._timed(stamps), tracks
 
     def _add_transforms(self, message: Any, arrived: int, links: dict[tuple[str, str], list[Sample]]) -> None:
@@ -493,12 +528,31 @@ def _parts(path: Path) -> list[Path]:
     match = _PART.fullmatch(path.stem)
     if match is None or int(match[2]) != 0:
         return [path]
-    others = [file for file in path.parent.glob(f"*{path.suffix}") if file.stem.startswith(f"{match[1]}_")]
-    numbered = {_part_number(file): file for file in others if _PART.fullmatch(file.stem)}
     parts = [path]
-    while len(parts) in numbered:
-        parts.append(numbered[len(parts)])
+    for file in _parts_after(path):
+        if _part_number(file) == len(parts):
+            parts.append(file)
     return parts
+
+
+def _parts_after(path: Path) -> list[Path]:
+    """Return the files that may be parts of the bag with this first part, in the order of their numbers."""
+    name, first = _recording(path)
+    others = [file for file in path.parent.glob(f"*{path.suffix}") if _PART.fullmatch(file.stem)]
+    starts = {file: start for file in others for each, start in [_recording(file)] if each == name}
+    later = [start for file, start in starts.items() if _part_number(file) == 0 and start > first]
+    after = [file for file, start in starts.items() if start >= first and not any(start >= each for each in later)]
+    numbers = [_part_number(file) for file in after]
+    # Two files of one number are of two recordings at a time, if their names have times.
+    return sorted((file for file in after if not first or numbers.count(_part_number(file)) == 1), key=_part_number)
+
+
+def _recording(file: Path) -> tuple[str, str]:
+    """Return the name of a file without its number and time, which its parts share, and the time, "" = none."""
+    match = _PART.fullmatch(file.stem)
+    stem = match[1] if match else file.stem
+    start = _START.search(stem)
+    return _START.sub("", stem, count=1), start[0] if start else ""
 
 
 def _part_number(file: Path) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import weakref
 from functools import cached_property, partial
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any, Sequence
 
 import numpy as np
 
+from cflow_torch.data.arrays.cloud_file import in_single
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import visible
@@ -16,7 +18,7 @@ from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argove
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, source_for_random_access
 from cflow_torch.data.point_times import find_times
-from cflow_torch.errors import CFlowError, MissingFile, import_optional
+from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.transforms import poses_from_quaternions, rigid_transform
 from cflow_torch.types import Sweep
 from cflow_torch.windows.returns import missing_returns
@@ -59,7 +61,8 @@ class HDF5Log(Log):
 
     Attributes:
         timestamps: nanoseconds, ascending. Names of groups (`sweep_name`) may be nanoseconds, microseconds, seconds
-            with decimals, or numbers 000000, 000001, ... Sweeps with numbers have no `timestamp_ns`.
+            with decimals (1700000000.05, 1700000000_050000000), dates, or numbers (000000, frame_0). Sweeps with
+            numbers have no `timestamp_ns`.
         ego_T_lidar: (4, 4) float64, the transform in use.
 
     Convention:
@@ -97,9 +100,16 @@ class HDF5Log(Log):
         self._scene.close()
 
     def sweep(self, index: int) -> Sweep:
-        """Read sweep `index`: float32 points, float64 pose of their frame; ground mask and times if stored."""
+        """Read sweep `index`: points, float64 pose of their frame; ground mask and times if stored.
+
+        Points are float32, but float64 in the frame of a map that is too far for float32. `missing_returns` are NaN.
+        """
         rows, timestamp = self._rows(index), self.timestamps[index]
-        points = self._values(index, "lidar", None, np.float32)
+        points = self._values(index, "lidar")[:, :3]
+        points = points if points.dtype == np.float64 else points.astype(np.float32)
+        is_missing = missing_returns(points) | (np.abs(points) > np.finfo(np.float32).max).any(axis=1)
+        if is_missing.any():
+            points = np.where(is_missing[:, None], points.dtype.type(np.nan), points)
         is_ground = self._values(index, "ground_mask", rows, np.bool_)
         pose = self._stored_pose(index)
         if pose is None and self._needs_poses:
@@ -111,8 +121,9 @@ class HDF5Log(Log):
             pose = rigid_transform(pose, f"pose of sweep {self.sweep_name(index)} in {self.file}") @ self.ego_T_lidar
         time = None if self.timestamps[-1] < _FIRST_MICROSECOND else timestamp  # None: the groups are numbered
         if pose is not None and not np.isfinite(pose).all():
-            raise MissingFile(f"{self.file}: the pose of sweep {self.sweep_name(index)} is not finite")
-        return Sweep(points[:, :3], is_ground, pose, time, self._point_times(index, time, points))
+            raise CFlowError(f"{self.file}: the pose of sweep {self.sweep_name(index)} is not finite")
+        times = self._point_times(index, time, points)
+        return Sweep(in_single(points), is_ground, pose, time, times)
 
     def _point_times(self, index: int, time: int | None, points: np.ndarray) -> np.ndarray | None:
         """Read the (N,) seconds from the sweep to its points; those of another unit or clock are converted."""
@@ -262,13 +273,23 @@ scene_errors = partial(file_errors, hint="copy or write the scene again")
 
 
 def sweep_names(scene: Any) -> dict[int, str]:
-    """Return the time stamp of each sweep of an open scene, nanoseconds, and the name of its group."""
+    """Return the time stamp of each sweep of an open scene, nanoseconds, or its number, and the name of its group.
+
+    Names are numbers. Otherwise they are those that are alike apart from their digits, and state times or numbers.
+    """
     names = {int(name): name for name in scene if is_timestamp(name)}
     if _FIRST_MICROSECOND <= max(names, default=0) < _FIRST_NANOSECOND:
         names = {1000 * stamp: name for stamp, name in names.items()}
-    decimals = [name for name in scene if "." in name]
-    stamps = None if names else times_of_names(decimals)
-    return names if stamps is None else dict(zip(stamps, decimals))
+    if names:
+        return names
+    forms: dict[str, list[str]] = {}
+    for name in scene:
+        if re.search("[0-9]", name):
+            forms.setdefault(re.sub("[0-9]+", "0", name), []).append(name)
+    alike = max(forms.values(), key=len, default=[])
+    numbers = [re.findall("[0-9]+", name) for name in alike]
+    stamps = times_of_names(alike) or [int(each[0]) for each in numbers if len(each) == 1 and len(each[0]) < 19]
+    return dict(zip(stamps, alike)) if len({*stamps}) == len(alike) else {}
 
 
 def import_h5py() -> Any:
