@@ -234,7 +234,8 @@ class VerifiedConfig(_WithHistory):
     min_height: Optional[float] = setting(
         0.4,
         "metres: where the ground is known, the method ignores pixels that rise less than this above the ground around "
-        "them, unless a higher pixel is near. None = it ignores none",
+        "them, unless a higher pixel is near. In the end, their points next to a moving object move with it. None = it "
+        "ignores none",
         optional=True,
         above=0,
         high=1000,

@@ -19,6 +19,7 @@ from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
 _NEAR = 0.5  # metres, rows and columns to a moving pixel
 _LOWEST = 10  # centimetres above the mean of the ground around; lower points are ground
+_MOST = 10_000  # points that we look around at a time
 
 
 def find_low_points(sweeps: HeightSlicedSweeps, is_moving: Tensor) -> tuple[Tensor, Tensor]:
@@ -33,10 +34,26 @@ def find_low_points(sweeps: HeightSlicedSweeps, is_moving: Tensor) -> tuple[Tens
 
     Convention: distances are those between the pixels. Ties: the first pixel in raster order.
 
-    Cost: 121 lookups for each point that is not drawn, and at least 0.1 m above the ground.
+    Cost: for each point that is not drawn, but at least 0.1 m above the ground, 121 lookups if a pixel is 0.1 m large.
     """
-    row = _low_rows(sweeps)
-    window, _ = split_index(sweeps.batch.image.index_select(0, row).long(), sweeps.num_steps)
+    batch = sweeps.batch
+    row = flat_nonzero(batch.is_active & batch.has_result & ~sweeps.points.is_member)
+    if batch.ground is None:
+        return row[:0], row[:0]
+    window, step = split_index(batch.image.index_select(0, row).long(), sweeps.num_steps)
+    position = take_columns(batch.positions, row)
+    is_above = 100 * position[2] >= batch.ground.at(position, window, batch.ground.mean() + _LOWEST)
+    low = flat_nonzero(is_above & (step == 1))
+    row, window = row.index_select(0, low), window.index_select(0, low)
+    found = [_nearest_moving(sweeps, is_moving, *some) for some in zip(row.split(_MOST), window.split(_MOST))]
+    rows, pixels = zip(*found)
+    return torch.cat(rows), torch.cat(pixels)
+
+
+def _nearest_moving(
+    sweeps: HeightSlicedSweeps, is_moving: Tensor, row: Tensor, window: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return those of some low points of t that are near a moving pixel, and this pixel, (K,) int64 each."""
     row_col = torch.stack(sweeps.grid.row_col(take_columns(sweeps.batch.positions, row))).long()  # [2, L]
     offset = _nearest_first(sweeps.grid.whole_pixels(_NEAR), row.device)  # [2, M, 1]
     around = sweeps.columns.pixel_in(window, 1, row_col[:, None] + offset, sweeps.num_pixels)  # M L items
@@ -45,18 +62,6 @@ def find_low_points(sweeps: HeightSlicedSweeps, is_moving: Tensor) -> tuple[Tens
     nearest = take_columns(is_near, found).byte().argmax(0)  # the first of several
     pixel = around.of_item.index_select(0, nearest * len(row) + found)
     return row.index_select(0, found), pixel
-
-
-def _low_rows(sweeps: HeightSlicedSweeps) -> Tensor:
-    """Return the rows of the points of t that are not drawn, but a little above the ground, (L,) int64."""
-    batch = sweeps.batch
-    row = flat_nonzero(batch.is_active & batch.has_result & ~sweeps.points.is_member)
-    if batch.ground is None:
-        return row[:0]
-    window, step = split_index(batch.image.index_select(0, row).long(), sweeps.num_steps)
-    position = take_columns(batch.positions, row)
-    is_above = 100 * position[2] >= batch.ground.at(position, window, batch.ground.mean() + _LOWEST)
-    return row.index_select(0, flat_nonzero(is_above & (step == 1)))
 
 
 def _nearest_first(reach: int, device: torch.device) -> Tensor:

@@ -11,7 +11,7 @@ ground: four kinds of scenes, seeds 100-103, and motorways, seeds 822-825. We ev
 on drives with seeds 500-501. docs/verified.md explains the columns.
 
 Points that are not drawn are low, and mostly ground that the mask misses. Simulated masks are exact, so we fit these
-points on real drives: the Argoverse 2 pair, KITTI 0000, 0-15, and PandaSet 002, 0-27.
+points on real drives as well: the Argoverse 2 pair, KITTI 0000, 0-15, and PandaSet 002, 0-27.
 """
 
 from __future__ import annotations
@@ -179,15 +179,15 @@ def main() -> None:
     torch.set_num_threads(1)
     pair = [sets.make_item(item.window, item.frame.labels) for item in sets.av2_pair()]  # ego motion of the poses
     if given.task != "evaluate":
+        items = list(simulated(SEEDS, MOTORWAYS))
         if given.task != "fit-low":
-            items = list(simulated(SEEDS, MOTORWAYS))
             first_bin = LOW + 1 if given.task == "fit" else confidence.Bins.moving
             for _ in range(2):  # P(moving) decides which objects move, and so which points are right
                 for name, values in fit(statistics(items, (0, HISTORY), MAX_POINTS)).items():
                     confidence.TABLE[name][first_bin:] = values[first_bin:]
         if given.task != "fit-objects":
             real = [*pair, *sets.kitti(sets.KITTI)[HISTORY:], *sets.kitti(sets.PANDASET["a1"])[HISTORY:]]
-            for name, values in fit(statistics(real, (0, HISTORY), MAX_POINTS)).items():
+            for name, values in fit(statistics([*items, *real], (0, HISTORY), MAX_POINTS)).items():
                 confidence.TABLE[name][LOW] = values[LOW]
         TABLE_FILE.write_text(json.dumps(confidence.TABLE) + "\n", encoding="utf-8")
         return
