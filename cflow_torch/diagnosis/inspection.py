@@ -72,13 +72,13 @@ class Inspection:
         first = windows[0]
         if not self._has_seen_points:
             self._has_seen_points = True
-            problem = frame_problem(first.pc0.points)[1] or tilt_problem([first.pc0.points])
-            if problem:
-                self._has_seen_structure = True  # in another frame, readings of the poses mean nothing
-            elif first.pc0.is_ground is None:
+            problem = frame_problem(first.pc0.points)[1]
+            self._has_seen_structure = bool(problem)  # in another frame, readings of the poses mean nothing
+            problem = problem or tilt_problem([first.pc0.points])
+            if not problem and first.pc0.is_ground is None:
                 missed = f"a sweep without a ground mask {_GROUND}, all False if this is not ground"
                 problem = missed if has_ground(first.pc0.points) else ""
-            elif as_numpy(first.pc0.is_ground).any():  # else you say that there is no ground
+            elif not problem and as_numpy(first.pc0.is_ground).any():  # else you say that there is no ground
                 problem = mask_problem(first.pc0)
                 problem = problem and f"the ground mask of pc0 is {problem}"
             if problem:

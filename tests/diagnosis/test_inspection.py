@@ -64,3 +64,17 @@ def test_a_tilt_of_one_sweep_is_not_that_of_a_log_whose_other_sweeps_have_no_gro
     wall = np.random.default_rng(0).uniform((5, -20, 0), (5.1, 20, 9), (1000, 3))
     assert "tilted by about 25 degrees" in tilt_problem([tilted] * 4 + [wall])
     assert tilt_problem([tilted, *[wall] * 4]) == tilt_problem([]) == ""
+
+
+def test_under_a_tilt_the_ego_motion_is_judged_too(right):
+    tilt = as_matrix(rotations_about(0, np.radians(10)))
+
+    def tilted(sweep, pose):
+        return replace(sweep, points=transform_points(sweep.points, tilt), pose=pose @ np.linalg.inv(tilt))
+
+    first, second = (tilted(right.pc0, right.pc0.pose), tilted(right.pc1, right.pc1.pose))
+    (said,) = said_of(replace(right, pc0=first, pc1=second, pch=()))
+    assert "tilted by about 10 degrees" in said
+    swapped = replace(right, pc0=replace(first, pose=second.pose), pc1=replace(second, pose=first.pose), pch=())
+    said = said_of(swapped)
+    assert "tilted by about 10 degrees" in said[0] and "in place as given" in said[1]
