@@ -270,6 +270,16 @@ def test_images_and_labels_in_arrays_are_no_logs(shape: tuple, tmp_path: Path) -
     assert find_sources("arrays", tmp_path) == [tmp_path / "scans"]
 
 
+@pytest.mark.parametrize("shape", [(0, 0), (0, 3), (0,)])
+def test_an_empty_first_array_does_not_tell_what_a_folder_holds(shape: tuple, tmp_path: Path) -> None:
+    for place, others in (("scans", (5, 3)), ("classes", (5,))):
+        (tmp_path / place).mkdir()
+        for number in range(3):
+            np.save(tmp_path / place / f"{number}.npy", np.ones(others if number else shape))
+    assert find_sources("arrays", tmp_path) == [tmp_path / "scans"]
+    assert len(cflow_torch.open(tmp_path / "scans", check=False)) == 3
+
+
 def write_table(table: pa.Table, file: Path) -> None:
     write = {".feather": feather.write_feather, ".parquet": parquet.write_table, ".csv": csv.write_csv}[file.suffix]
     write(table, str(file))
