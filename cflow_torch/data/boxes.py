@@ -58,7 +58,7 @@ def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> list[int
     if unknown:
         warn(
             f"we do not know the categories {shortened(unknown[:_LISTED])} of boxes, so labels have the flow of these "
-            "boxes, but no category"
+            "boxes, but no category, and bucketed scores count their points as background"
         )
     return [CATEGORY_INDEX[known.get(name, _NO_CATEGORY)] for name in names]
 

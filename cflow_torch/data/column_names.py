@@ -29,7 +29,8 @@ _ROLES = {
     "pitch": ".*pitch(deg|degrees|rad|radians)?",
     "yaw": ".*(yaw|heading|theta)(deg|degrees|rad|radians)?",
 }
-_ROTATIONS = (("qx", "qy", "qz"), ("q0", "q1", "q2", "q3"), ("roll", "pitch", "yaw"))
+_QUATERNIONS = ({"qx", "qy", "qz"}, {"q0", "q1", "q2", "q3"})
+_ANGLES = {"roll", "pitch", "yaw"}
 _TIME_OF_POINT = "((d|delta)?t|.*time|.*stamp|(t|.*time|.*stamp)?offset)(s|secs?|nsecs?|ns|us|ms|unix)?"
 _FEWEST_COUNTED = 20  # rows of a column that surely counts them
 _OTHERS = "normal|twist|linear|angular|veloc|accel|covariance|rate"
@@ -80,9 +81,14 @@ def role_of_name(name: str) -> str | None:
 
 
 def are_of_poses(names: Iterable[str]) -> bool:
-    """Test whether columns hold rotations, as those of poses or boxes do: a quaternion, or three angles."""
+    """Test whether columns hold rotations, as those of poses or boxes do: a quaternion, or three angles.
+
+    Points of mobile mapping have the angles of the vehicle next to x, y, z.
+    """
+    names = list(names)
     roles = {role_of_name(name) for name in names}
-    return any(set(rotation) <= roles for rotation in _ROTATIONS)
+    has_angles = roles >= _ANGLES and not set(AXES) <= {name.lower() for name in names}
+    return has_angles or any(quaternion <= roles for quaternion in _QUATERNIONS)
 
 
 def check_no_poses(names: Sequence[str]) -> None:

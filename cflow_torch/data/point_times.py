@@ -14,7 +14,7 @@ _SHORTEST_HALF, _LONGEST_HALF = 0.0015, 1.4
 _USUAL_PERIOD, _LONGEST_PERIOD = 0.1, 0.25  # seconds between sweeps; a log with more is thinned
 _LARGEST_LAG = 1.5  # periods from the stamp of a sweep to its nearest point; more means another clock
 _REPEATED = 0.01  # a single time of more points than this share is a default value, if no other time has many points
-_MOST_STRAY = 0.2  # share of the points; with more, the column holds other numbers
+_MOST_STRAY = 0.2  # share of the points with stray values besides one; with more, the column holds other numbers
 _LATEST = 2.0**64  # integers that fit; larger floats are no times in any unit
 _COARSE = 8  # steps of a float in that half; with fewer, the type cannot hold the times
 
@@ -69,8 +69,8 @@ def seconds_after(
     Convention:
         - Integers that wrapped go on: we take differences from the median modulo the range of their type.
         - Stray values are not finite, or farther from the median than a sweep lasts, or one value that more than 1 % of
-          the points share (drivers write 0 for lost packets). If more than a fifth of the points have such values,
-          these are not times.
+          the points share (drivers write 0 for lost packets). If more than a fifth of the points have such values
+          besides the most frequent one, these are not times.
         - The unit is the one of s, ms, us and ns in which a sweep has a plausible duration. Floats that fill the range
           from 0 to 1 are shares of a sweep.
         - Times count from the stamp or, if that is clearly closer to the stamp, from the epoch of the stamp. If neither
@@ -80,11 +80,12 @@ def seconds_after(
     nothing = np.zeros(len(values), bool)
     missing = nothing if is_missing is None else is_missing
     is_given = ~missing & np.isfinite(values)
+    stored = values
     values = np.where(is_given, values, values.dtype.type(0))  # computing with signalling NaN warns
     is_stray = ~is_given | (np.abs(values.astype(np.float64)) > _LATEST)
     is_stray[is_given] |= _is_default(values[is_given])
     if is_stray.all():
-        return PointTimes(None, nothing, "no time of a point is finite")
+        return PointTimes(None, nothing, "" if missing.all() else "no time of a point is finite")
     known = values[~is_stray]
     centre = np.partition(known, len(known) // 2)[len(known) // 2]
     ticks = _differences(values, centre)
@@ -93,7 +94,7 @@ def seconds_after(
     if _is_share(known):
         duration = period if period is not None and period <= _LONGEST_PERIOD else _USUAL_PERIOD
         note = f"times of points go from 0 to 1, so we take them for shares of a sweep of {duration:.3g} s"
-        return _without_stray(np.where(is_stray, 0.0, values) * duration, is_stray, missing, note)
+        return _without_stray(np.where(is_stray, 0.0, values) * duration, is_stray, missing, stored, note)
     if values.dtype.kind == "f" and abs(centre) > 1 and half < _COARSE * np.spacing(abs(centre)):
         return PointTimes(
             None, nothing, f"times of points near {centre:.10g} are too coarse in {values.dtype}: ignored"
@@ -113,15 +114,24 @@ def seconds_after(
         if stamp_ns is not None:
             note = f"times of points have another clock than the sweeps ({lag:+.6g} s), so the first is at the stamp"
         lag = -float(seconds[~is_stray].min())
-    return _without_stray(np.where(is_stray, 0.0, seconds) + lag, is_stray, missing, note)
+    return _without_stray(np.where(is_stray, 0.0, seconds) + lag, is_stray, missing, stored, note)
 
 
-def _without_stray(seconds: np.ndarray, is_stray: np.ndarray, missing: np.ndarray, note: str) -> PointTimes:
-    """Return the times of which some are stray; they are none at all if too many are. Missing returns do not count."""
+def _without_stray(
+    seconds: np.ndarray, is_stray: np.ndarray, missing: np.ndarray, stored: np.ndarray, note: str
+) -> PointTimes:
+    """Return the times of which some are stray; they are none at all if too many of many values are.
+
+    The most frequent stray value does not count, because drivers write one for lost packets. Neither do missing
+    returns.
+    """
     is_stray = is_stray & ~missing
-    share = is_stray.sum() / max((~missing).sum(), 1)
-    if share > _MOST_STRAY:
+    num_returns = (~missing).sum()
+    bits = stored[is_stray].view(f"u{stored.dtype.itemsize}")  # comparing signalling NaN warns
+    _, counts = np.unique(bits, return_counts=True)
+    if counts.sum() - counts.max(initial=0) > _MOST_STRAY * num_returns:
         none = np.zeros(len(seconds), bool)
+        share = counts.sum() / num_returns
         return PointTimes(None, none, f"{100 * share:.0f} % of the times of points are stray: ignored")
     return PointTimes(seconds, is_stray, note)
 

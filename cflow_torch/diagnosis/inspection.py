@@ -72,15 +72,9 @@ class Inspection:
         first = windows[0]
         if not self._has_seen_points:
             self._has_seen_points = True
-            problem = frame_problem(first.pc0.points)[1] or tilt_problem([first.pc0.points])
-            if problem:
-                self._has_seen_structure = True  # in another frame, readings of the poses mean nothing
-            elif first.pc0.is_ground is None:
-                missed = f"a sweep without a ground mask {_GROUND}, all False if this is not ground"
-                problem = missed if has_ground(first.pc0.points) else ""
-            elif as_numpy(first.pc0.is_ground).any():  # else you say that there is no ground
-                problem = mask_problem(first.pc0)
-                problem = problem and f"the ground mask of pc0 is {problem}"
+            problem = frame_problem(first.pc0.points)[1]
+            self._has_seen_structure = bool(problem)  # in another frame, readings of the poses mean nothing
+            problem = problem or tilt_problem([first.pc0.points]) or _ground_problem(first.pc0)
             if problem:
                 warn(problem)
             _, num_missing = without_missing(first.pc0)
@@ -93,6 +87,17 @@ class Inspection:
                 warn(f"{judgement}: {_ADVICE.get(judgement.best[0], _ADVICE_ELSE)}")
             elif first.pch and _fits_only(first.pc0, first.pc1, first.pch[0]):
                 warn(_HISTORY)
+
+
+def _ground_problem(pc0: Sweep) -> str:
+    """Return what is wrong with the ground mask of pc0, or that it lacks one; "" = nothing."""
+    if pc0.is_ground is None:
+        missed = f"a sweep without a ground mask {_GROUND}, all False if this is not ground"
+        return missed if has_ground(pc0.points) else ""
+    if not as_numpy(pc0.is_ground).any():  # you say that there is no ground
+        return ""
+    problem = mask_problem(pc0)
+    return problem and f"the ground mask of pc0 is {problem}"
 
 
 def mask_problem(sweep: Sweep) -> str:

@@ -78,6 +78,8 @@ def frame_problem(points: Array) -> tuple[str, str]:
 def tilt_problem(sweeps: Iterable[Array]) -> str:
     """Return by how much the sensor is tilted, and how to level it, if most sweeps agree; "" = it is level or unknown.
 
+    Sweeps without ground do not agree.
+
     Args:
         sweeps: points of each, (N, 3+), without a `frame_problem`. If the first one is level, others are not read.
 
@@ -89,8 +91,10 @@ def tilt_problem(sweeps: Iterable[Array]) -> str:
         tilt = _tilt_of(positions) if len(positions) >= _FEWEST else None
         if not tilts and (tilt is None or np.hypot(*tilt) < _LEAST_TILT):
             return ""
-        tilts += [] if tilt is None else [tilt]
-    about_x, about_y = usual = np.median(tilts, axis=0)
+        tilts.append(np.full(2, np.nan) if tilt is None else tilt)
+    if not tilts:
+        return ""
+    about_x, about_y = usual = np.nanmedian(tilts, axis=0)
     size = float(np.hypot(*usual))
     are_near = np.linalg.norm(tilts - usual, axis=1) <= _TILT_APART * size
     if size < _LEAST_TILT or are_near.mean() < _AGREEING:

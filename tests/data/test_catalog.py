@@ -270,15 +270,40 @@ def test_images_and_labels_in_arrays_are_no_logs(shape: tuple, tmp_path: Path) -
     assert find_sources("arrays", tmp_path) == [tmp_path / "scans"]
 
 
+@pytest.mark.parametrize("shape", [(0, 0), (0, 3), (0,)])
+def test_an_empty_first_array_does_not_tell_what_a_folder_holds(shape: tuple, tmp_path: Path) -> None:
+    for place, others in (("scans", (5, 3)), ("classes", (5,))):
+        (tmp_path / place).mkdir()
+        for number in range(3):
+            np.save(tmp_path / place / f"{number}.npy", np.ones(others if number else shape))
+    assert find_sources("arrays", tmp_path) == [tmp_path / "scans"]
+    assert len(cflow_torch.open(tmp_path / "scans", check=False)) == 3
+
+
+def write_table(table: pa.Table, file: Path) -> None:
+    write = {".feather": feather.write_feather, ".parquet": parquet.write_table, ".csv": csv.write_csv}[file.suffix]
+    write(table, str(file))
+
+
 @pytest.mark.parametrize("suffix", [".feather", ".parquet", ".csv"])
 def test_tables_of_boxes_are_no_clouds(suffix: str, tmp_path: Path) -> None:
     """Their times repeat, so they are not a trajectory either."""
     names = ["timestamp_ns", "length_m", "width_m", "height_m", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"]
     table = pa.table({name: np.full(30, 0.5) for name in names})
-    write = {".feather": feather.write_feather, ".parquet": parquet.write_table, ".csv": csv.write_csv}[suffix]
     for name in ("objects_1", "objects_2"):
-        write(table, str(tmp_path / (name + suffix)))
+        write_table(table, tmp_path / (name + suffix))
     with pytest.raises(CFlowError, match="poses or boxes"):
         read_cloud(tmp_path / f"objects_1{suffix}")
     with pytest.raises(CFlowError, match="no folder of point clouds"):
         find_sources("arrays", tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".feather", ".parquet", ".csv"])
+def test_points_of_mobile_mapping_have_angles_and_are_clouds(suffix: str, tmp_path: Path) -> None:
+    file = tmp_path / f"scan{suffix}"
+    angles = {name: np.full(30, 0.5) for name in ("heading", "pitch", "roll")}
+    write_table(pa.table({**dict(zip("XYZ", np.eye(30)[:3])), **angles}), file)
+    assert np.array_equal(read_cloud(file), np.eye(30)[:, :3])
+    write_table(pa.table({**dict(zip(("tx_m", "ty_m", "tz_m"), np.eye(30)[:3])), **angles}), file)
+    with pytest.raises(CFlowError, match="poses or boxes"):
+        read_cloud(file)

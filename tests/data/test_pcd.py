@@ -77,6 +77,52 @@ def test_fields_of_a_text_that_are_characters_are_left_out_and_said(tmp_path):
             read_cloud(tmp_path / "a.pcd")
 
 
+def text_of(names: str, types: str, rows: list[str]) -> bytes:
+    """A text with fields of types such as f4 and u1."""
+    kinds = types.split()
+    sizes, letters = ("".join(f" {kind[part]}" for kind in kinds).upper() for part in (1, 0))
+    header = f"FIELDS {names}\nSIZE{sizes}\nTYPE{letters}\nWIDTH {len(rows)}\nHEIGHT 1\nDATA ascii\n"
+    return "\n".join([header.strip(), *rows]).encode()
+
+
+@pytest.mark.parametrize("names", ["tag x y z i", "x y z i j", "x y z i tag", "tag x y z line", "a b c d tag"])
+def test_rows_with_too_few_words_are_an_error_if_fields_before_x_y_z_or_no_characters_may_be_missing(names):
+    kinds = {"tag": "u1", "line": "u1"}
+    rows = ["1 2 3 4 5", "1 2 3 4" if names != "x y z i tag" else "1 2 3", "1 2 3 4 5"]
+    types = " ".join(kinds.get(name, "f4") for name in names.split())
+    with pytest.raises(ValueError, match="fewer than 5 numbers|2 points"):
+        pcd_fields(text_of(names, types, rows))
+
+
+def test_fields_behind_a_character_that_is_a_blank_are_left_out():
+    with pytest.warns(CFlowWarning, match="fields tag, t of .pcd files hold characters, or follow them"):
+        cloud = pcd_fields(text_of("x y z i tag t", "f4 f4 f4 f4 u1 f8", ["1 2 3 4 5 6", "1 2 3 4  6", "1 2 3 4 5 6"]))
+    assert {name: values.tolist() for name, values in cloud.items()} == dict(
+        zip("xyzi", ([1] * 3, [2] * 3, [3] * 3, [4] * 3))
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "word", "name"),
+    [("u4", "-1", "uint32"), ("u1", "300", "uint8"), ("i2", "nan", "int16"), ("u8", "1.5", "uint64")],
+)
+def test_numbers_that_a_type_does_not_have_are_said(kind, word, name):
+    with pytest.warns(CFlowWarning, match=f"field t of .* left out: it has {word}, which is not a number of {name}"):
+        assert "t" not in pcd_fields(text_of("x y z t", f"f4 f4 f4 {kind}", ["1 2 3 4", f"1 2 3 {word}"]))
+
+
+def test_words_are_an_error_in_fields_of_several_bytes():
+    with pytest.raises(ValueError, match="not a number"):
+        pcd_fields(text_of("x y z t", "f4 f4 f4 u2", ["1 2 3 a"]))
+
+
+@pytest.mark.parametrize("kind", ["i8", "u8"])
+def test_long_integers_of_texts_with_comments_and_decimals_are_exact(kind):
+    rows = ["1 2 3 1700000000123456789", "1 2 3 1700000000123456791.000"]
+    text = text_of("x y z t", f"f4 f4 f4 {kind}", rows).replace(b"\n1 2", b"\n# of a filter\n1 2")
+    assert pcd_fields(text)["t"].tolist() == [1700000000123456789, 1700000000123456791]
+
+
 def test_padding_and_vector_fields_are_left_out(tmp_path):
     rows = np.zeros(2, [("x", "<f4"), ("pad", "V4"), ("normal", "<f4", 3), ("t", "<u8")])
     rows["x"], rows["normal"], rows["t"] = (1.5, np.nan), 7, (3, 2**60 + 1)

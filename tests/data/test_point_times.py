@@ -86,6 +86,28 @@ def test_a_column_of_which_many_values_are_stray_holds_no_times(share: float) ->
     assert "stray: ignored" in times.note if share > 0.2 else np.array_equal(times.is_stray, is_wrong)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("stray", [0.0, np.nan, -1e300])
+def test_points_of_many_lost_packets_are_left_out_if_they_have_one_value(stray: float) -> None:
+    values = STAMP * 1e-9 + SHARES * 0.1
+    is_lost = np.arange(len(values)) % 10 < 3
+    values[is_lost] = stray
+    values[5] = 7.0  # and one other stray value
+    times = seconds_after(values, STAMP, 0.1)
+    is_stray = is_lost | (np.arange(len(values)) == 5)
+    assert times.seconds is not None and np.array_equal(times.is_stray, is_stray)
+    assert np.allclose(times.seconds[~is_stray], 0.1 * SHARES[~is_stray], atol=1e-6)
+
+
+def test_a_sweep_without_returns_has_no_times_and_that_is_not_said() -> None:
+    for size in (0, 5):
+        assert seconds_after(np.zeros(size), STAMP, 0.1, np.ones(size, bool)) == (
+            None,
+            pytest.approx(np.zeros(size)),
+            "",
+        )
+
+
 def test_missing_returns_have_no_stray_times() -> None:
     values = STAMP * 1e-9 + SHARES * 0.1
     is_missing = np.arange(len(values)) % 2 == 1
@@ -117,7 +139,6 @@ def test_times_are_read_in_a_thinned_log_and_without_a_period() -> None:
     [
         (np.zeros(30), "all equal"),
         (np.full(30, np.nan), "finite"),
-        (np.zeros(0), "finite"),
         (np.array([0.0, 1e-4]), "span"),
         (np.array([0, 1 << 62], np.uint64), "span"),
         ((STAMP * 1e-9 + SHARES * 0.1).astype(np.float32), "too coarse in float32"),  # steps of 128 s

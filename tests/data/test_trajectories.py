@@ -269,6 +269,15 @@ LAYOUTS = {
 }
 
 
+def test_a_single_matrix_whose_last_number_is_not_1_has_no_time(tmp_path) -> None:
+    pose = rows(POSES[0, :3])
+    (tmp_path / "pose.txt").write_text("\n".join([*pose, "0 0 0 5"]))
+    with pytest.raises(CFlowError, match="4 numbers per line"):
+        poses_text.read_poses(tmp_path / "pose.txt")
+    (tmp_path / "pose.txt").write_text(" ".join([*pose, "0 0 0 5"]))
+    assert poses_text.read_poses(tmp_path / "pose.txt").times_ns is None
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_layouts_of_poses(tmp_path, layout) -> None:
     (tmp_path / "poses.csv").write_text("\n".join(LAYOUTS[layout]))

@@ -10,7 +10,9 @@ import pytest
 
 from cflow_torch.data.log import window
 from cflow_torch.diagnosis.inspection import Inspection
+from cflow_torch.diagnosis.point_frame import tilt_problem
 from cflow_torch.simulator import make_drive
+from cflow_torch.transforms import as_matrix, rotations_about, transform_points
 
 
 @pytest.fixture(scope="module")
@@ -55,3 +57,24 @@ def test_a_history_with_other_poses_or_in_the_reverse_order_is_told(right):
     for history in (late, back):
         (said,) = said_of(replace(right, pch=tuple(history)))
         assert "the first sweep of the history does not fit pc0" in said
+
+
+def test_a_tilt_of_one_sweep_is_not_that_of_a_log_whose_other_sweeps_have_no_ground(right):
+    tilted = transform_points(right.pc0.points, as_matrix(rotations_about(0, np.radians(25))))
+    wall = np.random.default_rng(0).uniform((5, -20, 0), (5.1, 20, 9), (1000, 3))
+    assert "tilted by about 25 degrees" in tilt_problem([tilted] * 4 + [wall])
+    assert tilt_problem([tilted, *[wall] * 4]) == tilt_problem([]) == ""
+
+
+def test_under_a_tilt_the_ego_motion_is_judged_too(right):
+    tilt = as_matrix(rotations_about(0, np.radians(10)))
+
+    def tilted(sweep, pose):
+        return replace(sweep, points=transform_points(sweep.points, tilt), pose=pose @ np.linalg.inv(tilt))
+
+    first, second = (tilted(right.pc0, right.pc0.pose), tilted(right.pc1, right.pc1.pose))
+    (said,) = said_of(replace(right, pc0=first, pc1=second, pch=()))
+    assert "tilted by about 10 degrees" in said
+    swapped = replace(right, pc0=replace(first, pose=second.pose), pc1=replace(second, pose=first.pose), pch=())
+    said = said_of(swapped)
+    assert "tilted by about 10 degrees" in said[0] and "in place as given" in said[1]

@@ -115,7 +115,7 @@ def _kinds(folder: Path) -> _Kinds:
     """
     files = [path for path in visible(folder) if stem_of(path).lower() not in _OTHER_STEMS]
     kinds = _alike([path for path in files if suffix_of(path) in SUFFIXES])
-    kinds = {kind: same for kind, same in kinds.items() if not _has_no_points(min(same))}
+    kinds = {kind: same for kind, same in kinds.items() if not _have_no_points(same)}
     texts = [path for path in files if suffix_of(path) in cloud_text.SUFFIXES]
     counts = Counter(map(_pattern, texts))
     texts = [] if kinds else [path for path in texts if counts[_pattern(path)] > 1]
@@ -153,8 +153,17 @@ def _pattern(path: Path) -> str:
     return _COUNTERS.sub("*", stem_of(path)) + suffix_of(path)
 
 
-def _has_no_points(path: Path) -> bool:
-    """Test whether a file has no points, by the shape of an array (labels, masks, images) or its names (poses)."""
+def _have_no_points(files: Sequence[Path]) -> bool:
+    """Test whether files have no points, by the first one whose array is not empty, see `_has_no_points`."""
+    answers = map(_has_no_points, islice(sorted(files), _MOST))
+    return next((answer for answer in answers if answer is not None), False)
+
+
+def _has_no_points(path: Path) -> bool | None:
+    """Test whether a file has no points, by the shape of an array (labels, masks, images) or its names (poses).
+
+    None = its array is empty, so it may be either.
+    """
     if path.suffix.lower() in TABLES:
         return are_of_poses(names_in_table(path))
     if path.suffix.lower() != ".npy":
@@ -166,7 +175,7 @@ def _has_no_points(path: Path) -> bool:
             shape, _, kind = np.lib.format.read_array_header_1_0(file)
     except CFlowError:
         return False
-    return kind.kind in "biuf" and not may_be_cloud(shape)
+    return None if 0 in shape else kind.kind in "biuf" and not may_be_cloud(shape)
 
 
 def _is_text_cloud(path: Path) -> bool:

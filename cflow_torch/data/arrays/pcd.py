@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from decimal import Decimal
 from typing import Any, Mapping, Sequence
 
 import numpy as np
@@ -43,48 +44,78 @@ def _check_number(count: int, header: Mapping[str, Sequence[str]]) -> None:
 
 
 def _text_fields(body: bytes, header: Mapping[str, Sequence[str]]) -> dict[str, np.ndarray]:
-    """Read the fields of a text. Those besides x, y, z that are not numbers are left out, and we say so.
+    """Read the fields of a text. Those that are characters, or numbers of another type, are left out, and we say so.
 
-    PCL writes fields of one byte as characters, of which some are blanks or ends of lines.
+    PCL writes fields of one byte as characters, of which some are blanks or ends of lines. Then a row has fewer words,
+    and only the fields before are certain. So the first field of one byte must be behind x, y, z: otherwise, a row of
+    too few words is an error.
     """
-    names = header["FIELDS"]
-    columns = np.cumsum([0, *map(int, header["COUNT"])]).tolist()  # of the first value of each field, and the end
+    names, counts = header["FIELDS"], [int(count) for count in header["COUNT"]]
+    columns = np.cumsum([0, *counts]).tolist()  # of the first value of each field, and the end
     needed = [k for k, name in enumerate(names) if name.lower() in AXES] or list(range(len(names)))
-    lines = [line.split() for line in with_plain_nan(body).splitlines()]
-    rows = [words for words in lines if len(words) > columns[max(needed)]]
+    are_bytes = [size == "1" and name != "_" for size, name in zip(header["SIZE"], names)]
+    uncertain = [*are_bytes, True].index(True)  # the first field that may be a blank; others follow
+    if uncertain <= max(needed):
+        uncertain = len(names)
+    lines = [line.split() for line in with_plain_nan(body).splitlines() if not line.lstrip().startswith(b"#")]
+    rows = [words for words in lines if len(words) >= columns[uncertain]]
+    if uncertain == len(names) and len(rows) < sum(map(bool, lines)):
+        raise ValueError(f"a line of it has fewer than {columns[-1]} numbers")
     _check_number(len(rows), header)
-    if rows and len(rows[-1]) < columns[-1] and all(len(words) >= columns[-1] for words in rows[:-1]):
+    are_short = [len(words) < columns[-1] for words in rows]
+    if are_short[-1:] == [True] and sum(are_short) == 1:
         raise ValueError("its last line is not complete")
+    num_certain = uncertain if any(are_short) else len(names)
     fields, left_out = {}, []
     for k, name in enumerate(names):
-        if int(header["COUNT"][k]) > 1 or name == "_":
+        if counts[k] > 1 or name == "_":
             continue
+        if k >= num_certain:
+            left_out.append(name)
+            continue
+        kind = np.dtype(f"{header['TYPE'][k].lower()}{header['SIZE'][k]}")
         try:
-            kind = np.dtype(f"{header['TYPE'][k].lower()}{header['SIZE'][k]}")
             fields[name] = _numbers([words[columns[k]] for words in rows], kind)
-        except (ValueError, IndexError, OverflowError):
+        except OverflowError as error:
             if k in needed:
+                raise
+            warn(f"the field {name} of .pcd files is left out: {error}")
+        except ValueError:
+            if k in needed or not are_bytes[k]:
                 raise
             left_out.append(name)
     if left_out:
-        warn(f"the fields {', '.join(left_out)} of .pcd files hold characters, not numbers, so we leave them out")
+        warn(f"the fields {', '.join(left_out)} of .pcd files hold characters, or follow them, so we leave them out")
     return fields
 
 
 def _numbers(words: Sequence[bytes], kind: np.dtype[Any]) -> np.ndarray:
-    """Return the numbers in words; those that the type does not have are a ValueError."""
+    """Return the numbers in words. A word that is not a number is a ValueError.
+
+    A number that the type does not have is an OverflowError that names it.
+    """
     texts = np.array(words, np.bytes_)
     if kind.kind == "f":
         return texts.astype(kind)
     try:
-        numbers = texts.astype(np.uint64 if kind == np.uint64 else np.int64)
-    except ValueError:
-        numbers = texts.astype(np.float64)  # 7.000000
-    with np.errstate(invalid="ignore"):  # of NaN, which is found below
-        found = numbers.astype(kind)
-    if not np.array_equal(found, numbers):
-        raise ValueError(f"it has numbers that {kind.name} does not have")
-    return found
+        numbers = texts.astype(np.int64)
+    except (ValueError, OverflowError):  # 7.000000, or more than 63 bits
+        numbers = np.array([_integer(word, kind) for word in words], object)
+    limits = np.iinfo(kind)
+    is_outside = (numbers < limits.min) | (numbers > limits.max)
+    if is_outside.any():
+        raise OverflowError(f"it has {words[int(is_outside.argmax())].decode()}, which is not a number of {kind.name}")
+    return numbers.astype(kind)
+
+
+def _integer(word: bytes, kind: np.dtype[Any]) -> int:
+    try:
+        number = Decimal(word.decode())
+    except ArithmeticError as error:
+        raise ValueError(f"it has {word!r}, which is not a number") from error
+    if not number.is_finite() or abs(number) > 2**64 or number != number.to_integral_value():
+        raise OverflowError(f"it has {word.decode()}, which is not a number of {kind.name}")
+    return int(number)
 
 
 def pcd_viewpoint(content: bytes) -> np.ndarray | None:

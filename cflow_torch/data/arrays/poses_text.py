@@ -149,10 +149,13 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
 
 
 def _are_homogeneous(rows: np.ndarray) -> bool:
-    """Test whether rows, (K, 4), are the last ones of matrices: 0, 0, 0, and 1 or, as some programs write, a time."""
+    """Test whether rows, (K, 4), are the last ones of matrices: 0, 0, 0, and 1 or, as some programs write, a time.
+
+    One row does not tell a time.
+    """
     numbers = rows.astype(np.float64)
     last = numbers[:, 3]
-    return not numbers[:, :3].any() and bool((last == 1).all() or (np.diff(last) > 0).all())
+    return not numbers[:, :3].any() and bool((last == 1).all() or (len(last) > 1 and (np.diff(last) > 0).all()))
 
 
 def _are_quaternions(words: np.ndarray) -> bool:
