@@ -311,10 +311,6 @@ def test_a_log_of_every_second_sweep_is_moved_by_turns_not_by_pose_intervals(raw
     assert np.linalg.norm(moved - truth.sweep(3).points, axis=1).max() < 0.06  # chords of twice the length
 
 
-REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
-
-
-@pytest.mark.skipif(not (REAL / "kitti-raw").is_dir(), reason="the real scenes are not here")
 @pytest.mark.parametrize(
     ("scene", "reading"),
     [
@@ -326,9 +322,9 @@ REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
         ("pandaset-002/panda-002-c", "off"),
     ],
 )
-def test_real_drives(scene: str, reading: str) -> None:
+def test_real_drives(scene: str, reading: str, data_root: Path) -> None:
     pytest.importorskip("h5py")
-    log: Any = open_log("hdf5", REAL / f"{scene}.h5", check=False)
+    log: Any = open_log("hdf5", data_root / f"{scene}.h5", check=False)
     assert log.scan == reading
 
 
