@@ -14,12 +14,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import constant, flat_nonzero, split_index, take_columns
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
 _NEAR = 0.5  # metres, rows and columns to a moving pixel
 _LOWEST = 10  # centimetres above the mean of the ground around; lower points are ground
-_MOST = 10_000  # points that we look around at a time
 
 
 def find_low_points(sweeps: HeightSlicedSweeps, is_moving: Tensor) -> tuple[Tensor, Tensor]:
@@ -44,24 +44,26 @@ def find_low_points(sweeps: HeightSlicedSweeps, is_moving: Tensor) -> tuple[Tens
     position = take_columns(batch.positions, row)
     is_above = 100 * position[2] >= batch.ground.at(position, window, batch.ground.mean() + _LOWEST)
     low = flat_nonzero(is_above & (step == 1))
-    row, window = row.index_select(0, low), window.index_select(0, low)
-    found = [_nearest_moving(sweeps, is_moving, *some) for some in zip(row.split(_MOST), window.split(_MOST))]
-    rows, pixels = zip(*found)
-    return torch.cat(rows), torch.cat(pixels)
-
-
-def _nearest_moving(
-    sweeps: HeightSlicedSweeps, is_moving: Tensor, row: Tensor, window: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return those of some low points of t that are near a moving pixel, and this pixel, (K,) int64 each."""
-    row_col = torch.stack(sweeps.grid.row_col(take_columns(sweeps.batch.positions, row))).long()  # [2, L]
+    row, window, position = row[low], window[low], position[:, low]
     offset = _nearest_first(sweeps.grid.whole_pixels(_NEAR), row.device)  # [2, M, 1]
-    around = sweeps.columns.pixel_in(window, 1, row_col[:, None] + offset, sweeps.num_pixels)  # M L items
-    is_near = around.spread(is_moving, none=False).view(offset.shape[1], -1)  # [M, L]
-    found = flat_nonzero(is_near.any(0))
-    nearest = take_columns(is_near, found).byte().argmax(0)  # the first of several
-    pixel = around.of_item.index_select(0, nearest * len(row) + found)
-    return row.index_select(0, found), pixel
+    pixel = torch.empty_like(row)
+    for some in chunks(0, len(row), row.device, offset.shape[1]):
+        cell = torch.stack(sweeps.grid.row_col(position[:, some])).long()[:, None] + offset  # [2, M, L]
+        pixel[some] = _first_moving(sweeps, is_moving, window[some], cell)
+    found = flat_nonzero(pixel < sweeps.num_pixels)
+    return row[found], pixel[found]
+
+
+def _first_moving(sweeps: HeightSlicedSweeps, is_moving: Tensor, window: Tensor, cell: Tensor) -> Tensor:
+    """Return the first moving pixel of t in the cells of each of L points, (L,) int64; P' = none.
+
+    `window` is (L,) int64, and `cell`, (2, M, L) int64, has rows and columns.
+    """
+    pixels = sweeps.columns.pixel_in(window, 1, cell, sweeps.num_pixels)  # M L items
+    moves = pixels.spread(is_moving, none=False).view(cell.shape[1:])
+    first = moves.byte().argmax(0, keepdim=True)
+    pixel = pixels.of_item.view(cell.shape[1:]).gather(0, first)[0]
+    return torch.where(moves.any(0), pixel, sweeps.num_pixels)
 
 
 def _nearest_first(reach: int, device: torch.device) -> Tensor:

@@ -48,7 +48,6 @@ TABLE_FILE = Path(confidence.__file__).with_name("confidence.json")
 # Columns of the statistics, sums over the points of a bin: all points, and dynamic ones.
 POINTS, RIGHT_ONES, DYNAMIC, RIGHT_DYNAMIC, ERROR, DYNAMIC_ERROR, MISSED = range(7)
 FALSE_ALARMS = 0.02  # share of static points
-LOW = 0  # the bin of points that are not drawn
 
 
 def statistics(items: Iterable[Item], histories: Sequence[int], max_points: float = math.inf) -> np.ndarray:
@@ -181,14 +180,15 @@ def main() -> None:
     if given.task != "evaluate":
         items = list(simulated(SEEDS, MOTORWAYS))
         if given.task != "fit-low":
-            first_bin = LOW + 1 if given.task == "fit" else confidence.Bins.moving
+            first_bin = confidence.Bins.unmeasured if given.task == "fit" else confidence.Bins.moving
             for _ in range(2):  # P(moving) decides which objects move, and so which points are right
                 for name, values in fit(statistics(items, (0, HISTORY), MAX_POINTS)).items():
                     confidence.TABLE[name][first_bin:] = values[first_bin:]
         if given.task != "fit-objects":
+            low = confidence.Bins.left_out
             real = [*pair, *sets.kitti(sets.KITTI)[HISTORY:], *sets.kitti(sets.PANDASET["a1"])[HISTORY:]]
             for name, values in fit(statistics([*items, *real], (0, HISTORY), MAX_POINTS)).items():
-                confidence.TABLE[name][LOW] = values[LOW]
+                confidence.TABLE[name][low] = values[low]
         TABLE_FILE.write_text(json.dumps(confidence.TABLE) + "\n", encoding="utf-8")
         return
     kitti = [item for path in (sets.KITTI, sets.KITTI_LATER) for item in sets.kitti(path)[HISTORY:]]
