@@ -80,60 +80,60 @@ def seconds_after(
     nothing = np.zeros(len(values), bool)
     missing = nothing if is_missing is None else is_missing
     is_given = ~missing & np.isfinite(values)
-    stored = values
-    values = np.where(is_given, values, values.dtype.type(0))  # computing with signalling NaN warns
-    is_stray = ~is_given | (np.abs(values.astype(np.float64)) > _LATEST)
-    is_stray[is_given] |= _is_default(values[is_given])
+    given = np.where(is_given, values, values.dtype.type(0))  # computing with signalling NaN warns
+    is_stray = ~is_given | (np.abs(given.astype(np.float64)) > _LATEST)
+    is_stray[is_given] |= _is_default(given[is_given])
     if is_stray.all():
         return PointTimes(None, nothing, "" if missing.all() else "no time of a point is finite")
+    times = _converted(given, is_stray, stamp_ns, period)
+    if times.seconds is None:
+        return times
+    times = times._replace(is_stray=times.is_stray & ~missing)
+    share, share_besides = _shares_of_stray(values[times.is_stray], (~missing).sum())
+    if share_besides > _MOST_STRAY:
+        return PointTimes(None, nothing, f"{100 * share:.0f} % of the times of points are stray: ignored")
+    return times
+
+
+def _shares_of_stray(values: np.ndarray, num_returns: int) -> tuple[float, float]:
+    """Return the share of the returns that stray values, (S,), make up: of all, and of all but the most frequent one.
+
+    The most frequent one is often that of lost packets.
+    """
+    bits = values.view(f"u{values.dtype.itemsize}")  # comparing signalling NaN warns
+    _, counts = np.unique(bits, return_counts=True)
+    return len(values) / num_returns, (len(values) - counts.max(initial=0)) / num_returns
+
+
+def _converted(values: np.ndarray, is_stray: np.ndarray, stamp_ns: int | None, period: float | None) -> PointTimes:
+    """Convert times by their unit and clock, see `seconds_after`. Times far from the median become stray, too."""
     known = values[~is_stray]
     centre = np.partition(known, len(known) // 2)[len(known) // 2]
     ticks = _differences(values, centre)
-    early, late = np.quantile(ticks[~is_stray], (0.25, 0.75))
-    half = float(late - early)
+    half = float(np.subtract(*np.quantile(ticks[~is_stray], (0.75, 0.25))))
     if _is_share(known):
         duration = period if period is not None and period <= _LONGEST_PERIOD else _USUAL_PERIOD
         note = f"times of points go from 0 to 1, so we take them for shares of a sweep of {duration:.3g} s"
-        return _without_stray(np.where(is_stray, 0.0, values) * duration, is_stray, missing, stored, note)
+        return PointTimes(np.where(is_stray, 0.0, values) * duration, is_stray, note)
     if values.dtype.kind == "f" and abs(centre) > 1 and half < _COARSE * np.spacing(abs(centre)):
-        return PointTimes(
-            None, nothing, f"times of points near {centre:.10g} are too coarse in {values.dtype}: ignored"
-        )
+        note = f"times of points near {centre:.10g} are too coarse in {values.dtype}: ignored"
+        return PointTimes(None, np.zeros_like(is_stray), note)
     longest = min(max(0.8 * (period or 0), 1.5 * _USUAL_PERIOD), _LONGEST_HALF)
     unit = next((unit for unit in _UNITS if _SHORTEST_HALF <= half * unit * 1e-9 <= longest), None)
     if unit is None:
         why = "are all equal" if half == 0 else f"span about {2 * half:.4g}, which is not a sweep in s, ms, us or ns"
-        return PointTimes(None, nothing, f"times of points {why}: ignored")
+        return PointTimes(None, np.zeros_like(is_stray), f"times of points {why}: ignored")
     seconds = ticks * (unit * 1e-9)
-    reach = max(1.1 * min(period or _LONGEST_PERIOD, _LONGEST_PERIOD), 3e-9 * half * unit)
-    is_stray |= ~(np.abs(seconds) <= reach)
-    lag, note = _lag(centre, unit, stamp_ns or 0) * 1e-9, ""
-    farthest = _LARGEST_LAG * min(period or _LONGEST_PERIOD, _LONGEST_PERIOD)
-    is_before, is_after = lag + seconds[~is_stray].max() < -farthest, lag + seconds[~is_stray].min() > farthest
-    if is_before or is_after:
+    usual_period = min(period or _LONGEST_PERIOD, _LONGEST_PERIOD)
+    is_stray = is_stray | ~(np.abs(seconds) <= max(1.1 * usual_period, 3e-9 * half * unit))
+    lag = _lag(centre, unit, stamp_ns or 0) * 1e-9
+    first, last = seconds[~is_stray].min(), seconds[~is_stray].max()
+    note = ""
+    if lag + last < -_LARGEST_LAG * usual_period or lag + first > _LARGEST_LAG * usual_period:
         if stamp_ns is not None:
             note = f"times of points have another clock than the sweeps ({lag:+.6g} s), so the first is at the stamp"
-        lag = -float(seconds[~is_stray].min())
-    return _without_stray(np.where(is_stray, 0.0, seconds) + lag, is_stray, missing, stored, note)
-
-
-def _without_stray(
-    seconds: np.ndarray, is_stray: np.ndarray, missing: np.ndarray, stored: np.ndarray, note: str
-) -> PointTimes:
-    """Return the times of which some are stray; they are none at all if too many of many values are.
-
-    The most frequent stray value does not count, because drivers write one for lost packets. Neither do missing
-    returns.
-    """
-    is_stray = is_stray & ~missing
-    num_returns = (~missing).sum()
-    bits = stored[is_stray].view(f"u{stored.dtype.itemsize}")  # comparing signalling NaN warns
-    _, counts = np.unique(bits, return_counts=True)
-    if counts.sum() - counts.max(initial=0) > _MOST_STRAY * num_returns:
-        none = np.zeros(len(seconds), bool)
-        share = counts.sum() / num_returns
-        return PointTimes(None, none, f"{100 * share:.0f} % of the times of points are stray: ignored")
-    return PointTimes(seconds, is_stray, note)
+        lag = -float(first)
+    return PointTimes(np.where(is_stray, 0.0, seconds) + lag, is_stray, note)
 
 
 def _is_default(values: np.ndarray) -> np.ndarray:
