@@ -63,23 +63,18 @@ def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> list[int
     return [CATEGORY_INDEX[known.get(name, _NO_CATEGORY)] for name in names]
 
 
-def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return (N,) bool: which of the (N, 3) points lie inside a box of (3,) `size`, faces included.
+def rows_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return the rows of the points (N, 3+) inside a box of (3,) size around its centre, (K,) int64, ascending.
 
     `pose` is (4, 4) float64, box coordinates to the frame of the points.
     """
-    local = (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3]
-    x, y, z = (np.abs(local) <= np.asarray(size) / 2).T  # costs a tenth of `all` along the rows
-    return x & y & z  # type: ignore[no-any-return]
-
-
-def rows_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return the rows of the points inside a box, ascending. The arguments are those of `points_in_box`."""
     # A bounding square rules out most points first.
     apart_x, apart_y = np.abs(np.asarray(points[:, :2], np.float64) - pose[:2, 3]).T
     reach = np.linalg.norm(size) / 2 + 1e-6
     near = np.flatnonzero((apart_x <= reach) & (apart_y <= reach))
-    return near[points_in_box(points[near], size, pose)]  # type: ignore[no-any-return]
+    local = (np.asarray(points[near, :3], np.float64) - pose[:3, 3]) @ pose[:3, :3]
+    x, y, z = (np.abs(local) <= np.asarray(size) / 2).T  # costs a tenth of `all` along the rows
+    return near[x & y & z]  # type: ignore[no-any-return]
 
 
 class BoxLog(Log):

@@ -456,12 +456,17 @@ class GroundSegmentedLog(LogWrapper):
         is_ground: Any = ground_of(sweep.points, self.method)
         return replace(sweep, is_ground=is_ground)
 
+    def finds_ground(self, index: int) -> bool:
+        return self.log.sweep(index).is_ground is None or bool(self.wrong_masks)
+
     @cached_property
     def wrong_masks(self) -> str:
         """What is wrong with the masks of the log, by its typical sweeps, if a method is chosen; "" = nothing."""
         if self.method == "auto":
             return ""
         with suppress(CFlowError, OSError):  # `sweep` raises the error
+            if self.log.sweep(0).is_ground is None:
+                return ""
             sweeps = [self.log.sweep(index) for index in typical_sweeps(self.log)]
             masked = (sweep for sweep in sweeps if sweep.is_ground is not None and not frame_problem(sweep.points)[1])
             return next(filter(None, map(mask_problem, masked)), "")
@@ -470,8 +475,7 @@ class GroundSegmentedLog(LogWrapper):
     def findings(self) -> list[Finding]:
         findings = self.log.findings()
         if self.wrong_masks:
-            cause = self.wrong_masks.partition(":")[0].partition(",")[0]
-            text = f"a mask of the log is {cause}, so find_ground={self.method} replaces all masks"
+            text = f"find_ground={self.method} replaces all masks, because one is {self.wrong_masks}"
             return [*findings, Finding("ground", FOUND, text, True)]
         first = self.log.sweep(0)
         if self.method != "auto" or first.is_ground is not None or not has_ground(first.points):

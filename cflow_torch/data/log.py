@@ -181,6 +181,10 @@ class Log(ABC):
         self._timestamp(index)
         return index
 
+    def finds_ground(self, index: int) -> bool:
+        """Tell whether the ground mask of sweep `index` is ours, not one of the data set."""
+        return False
+
     def sweep_times(self, sweep_interval: float = 0.1) -> np.ndarray:
         """Return the (K,) float64 seconds of all sweeps, 0 for the first. Reads one sweep.
 
@@ -446,7 +450,7 @@ class _OfLog:
 for _name in (
     *("labels", "columns", "cameras", "poses", "trajectory", "readings", "judgement", "findings"),
     *("eval_mask", "stored_motion", "moving", "units", "boxes", "T_camera0_lidar", "sample_tokens"),
-    *("sweep_name", "frame_number", "sweep_times", "has_estimated_poses"),
+    *("sweep_name", "frame_number", "sweep_times", "finds_ground", "has_estimated_poses"),
     *("notes", "_note", "close", "unwrapped"),
 ):
     setattr(LogWrapper, _name, _OfLog(_name))  # `__getattr__` is not asked for members that `Log` has

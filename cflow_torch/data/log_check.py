@@ -304,8 +304,7 @@ def _mask(log: _CheckedLog) -> list[Finding]:
         if problem:
             text = f"the mask of {_name_of(index)} is {problem}; data.find_ground=grid replaces it"
             mask: Any = masks[index]
-            is_replaced = getattr(log, "wrong_masks", "")  # of `GroundSegmentedLog`
-            if log.unwrapped.sweep(index).is_ground is None or is_replaced:  # we made it
+            if log.finds_ground(index):
                 what = "other points than those of the ground" if as_numpy(mask).any() else "no ground"
                 text = f"we find {what} in {_name_of(index)}, which has some: {_OTHER_GROUND}"
             return [Finding("ground", WRONG, text, True)]

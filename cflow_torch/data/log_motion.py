@@ -24,8 +24,8 @@ _REACH = 10  # sweeps before and after a pair, whose poses may be those of the p
 _LEAST_SPEED, _LEAST_TIMED = 0.5, 0.1
 _UNCLEAR = 0.2  # share in place, below which poses that hardly move are compared with the motion of the sensor
 _LEAST_MOTION = 0.2  # metres between the sweeps of a pair, else the vehicle stands
-# A step between two poses is suspect if it differs from its neighbours' by this, plus a part of theirs: then
-# the points decide. A step that differs by more is left out where readings of all poses are compared.
+# A step between two poses is suspect if it differs from its neighbours' by this length plus this share of theirs. The
+# points then decide. Pairs of sweeps do not reach over steps that differ by the second length and share.
 _SUSPECT, _SUSPECT_SHARE = 0.15, 0.1
 _LEFT_OUT, _LEFT_OUT_SHARE = 0.2, 0.3
 _ARM = 10.0  # metres; a rotation counts as the motion of a point that far away
@@ -314,8 +314,12 @@ def find_lapses(log: Log) -> list[Lapse]:
         pair = make_pair(log.sweep(index), log.sweep(index + 1), in_world=False)
         if pair is None:
             continue
-        fitting = usual if _is_contradicted(pair, given, usual) else motion_of(pair, OFF)
-        if _is_contradicted(pair, given, fitting) and _fits_as_others(log, index, pair, fitting):
+        fitting = usual
+        is_wrong = _is_contradicted(pair, given, usual)
+        if not is_wrong:
+            fitting = motion_of(pair, OFF)
+            is_wrong = _is_contradicted(pair, given, fitting)
+        if is_wrong and _fits_as_others(log, index, pair, fitting):
             if lapses and lapses[-1].sweep == index and lapses[-1].kind == JUMP:
                 lapses[-1] = lapses[-1]._replace(kind=POSE)  # away from, and back to the trajectory
             else:

@@ -11,7 +11,7 @@ import numpy as np
 
 from cflow_torch.data.aevascenes import CATEGORY_NAME, GROUND
 from cflow_torch.data.atomic import new_folder
-from cflow_torch.data.boxes import Boxes, points_in_box
+from cflow_torch.data.boxes import Boxes, rows_in_box
 from cflow_torch.data.paths import safe_name
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.recording import UnitReturns
@@ -136,9 +136,7 @@ def _classes(log: Drive, index: int, boxes: Boxes) -> np.ndarray:
     points = np.asarray(sweep.points)[:, :3]
     classes = np.full(len(points), _CLASSES.index(_BACKGROUND), np.int64)
     for category, size, pose in zip(boxes.names, boxes.size, boxes.pose):
-        near = np.flatnonzero(np.abs(points[:, 0] - np.float32(pose[0, 3])) <= np.linalg.norm(size))
-        near = near[points_in_box(points[near], size, pose)]
-        classes[near] = _CLASSES.index(_class_of(category))
+        classes[rows_in_box(points, size, pose)] = _CLASSES.index(_class_of(category))
     if sweep.is_ground is not None:
         classes[np.asarray(sweep.is_ground)] = _CLASSES.index(_ON_GROUND)
     return classes

@@ -122,16 +122,18 @@ class HDF5Log(Log):
         time = None if self.timestamps[-1] < _FIRST_MICROSECOND else timestamp  # None: the groups are numbered
         if pose is not None and not np.isfinite(pose).all():
             raise CFlowError(f"{self.file}: the pose of sweep {self.sweep_name(index)} is not finite")
-        times = self._point_times(index, time, points)
+        times = self._point_times(index, time, points, is_missing)
         return Sweep(in_single(points), is_ground, pose, time, times)
 
-    def _point_times(self, index: int, time: int | None, points: np.ndarray) -> np.ndarray | None:
+    def _point_times(
+        self, index: int, time: int | None, points: np.ndarray, is_missing: np.ndarray
+    ) -> np.ndarray | None:
         """Read the (N,) seconds from the sweep to its points; those of another unit or clock are converted."""
         times = self._values(index, "lidar_dt", self._rows(index))
         if times is None or np.abs(times).max(initial=0) <= _LONGEST_LAG:
             return times if times is None else times.astype(np.float32)
         period = None if time is None else float(np.median(np.diff(self.timestamps))) * 1e-9
-        found = find_times({"time": times}, time, period, self._note, missing_returns(points[:, :3]))
+        found = find_times({"time": times}, time, period, self._note, is_missing)
         if found is None or found.seconds is None:
             return None
         points[found.is_stray] = np.nan

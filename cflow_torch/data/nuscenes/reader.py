@@ -8,7 +8,7 @@ from typing import ClassVar, Literal, Mapping, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, points_in_box
+from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, rows_in_box
 from cflow_torch.data.camera import Camera, at_image
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.log import FlowLabels, Log
@@ -271,5 +271,5 @@ class NuScenesLog(Log):
             tracks, _ = self._tracks.at(self._microseconds(index))
             for name, size, pose in zip(tracks.category, tracks.size, tracks.pose):
                 if name == OWN_TRAILER:
-                    own |= points_in_box(points, size, self._T_ego_world[index] @ pose)
+                    own[rows_in_box(points, size, self._T_ego_world[index] @ pose)] = True
         return own
