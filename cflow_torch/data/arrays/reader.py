@@ -56,7 +56,7 @@ class ArraysLog(Log):
             `read_poses`); or a (K, 4, 4) array.
         poses_of: whose poses these are: "ego", "lidar", or "sensor" = of another sensor. Then `ego_T_lidar` maps to
             this sensor, the ego frame is the LiDAR's, and the points stay. "auto" = of the LiDAR if they come from
-            VIEWPOINT, or if `ego_T_lidar` is given and the static world then stands still clearly better, else "ego".
+            VIEWPOINT, or if `ego_T_lidar` is given and the sweeps then fit clearly better, else "ego".
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
         times: "auto" = times.txt in the folder, or see `timestamps`; None = none; or a file with one time per sweep.

@@ -69,8 +69,8 @@ class Frames:
 
     `samples` are those of each parent and frame. Of several parents of a frame, we take the one with the most samples.
     Ties: the last. A transform connects two frames in either direction: another constant one is inverted if its parent
-    is not in the tree, and all transforms between the root and a frame of the world that moves in the vehicle (as
-    KISS-ICP publishes it) are inverted, so that the world is the root.
+    is not in the tree. If a world frame is published below the vehicle (as KISS-ICP does), all transforms between it
+    and the root are inverted, so that the world is the root.
 
     Attributes:
         inverted_world: the root if its transforms are inverted, and the frame in which it moved; () = none are.

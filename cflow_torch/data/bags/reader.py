@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import closing, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -182,18 +183,19 @@ class BagLog(Log):
         folders = [parent, *(path for path in visible(parent) if path.is_dir())]
         bags = [bag for folder in folders for bag in _bags_in(folder) if not bag.samefile(self.path)]
         for bag in sorted(bags)[:_MOST_OTHERS]:
-            try:
-                reader = self._open(_parts(bag))
-            except Exception:  # of any library, about a file that nobody asked for
-                continue
-            kinds = {each.topic: each.msgtype for each in reader.connections}
-            is_late, is_early = reader.start_time > max(arrived), reader.end_time < min(arrived)
-            reader.close()
-            moving = sorted(topic for topic, kind in kinds.items() if kind in _MOVING and topic != "/tf_static")
-            if moving and not (is_late or is_early):
-                other = bag.relative_to(parent)
-                what = f"{other} next to it has {', '.join(moving)} of the same time, which we do not read"
-                return f"{what}: merge both by rosbags-convert --src {self.path.name} {other} --dst merged"
+            parts = _parts(bag)
+            # Any error of a library is ignored, because nobody has given this file.
+            with suppress(Exception), closing(_open_bag(parts)) as reader:
+                if reader.start_time > max(arrived) or reader.end_time < min(arrived):
+                    continue
+                kinds = {each.topic: each.msgtype for each in reader.connections}
+                moving = sorted(topic for topic, kind in kinds.items() if kind in _MOVING and topic != "/tf_static")
+                if moving:
+                    files = " ".join(
+                        [*(file.name for file in self._files), *(str(p.relative_to(parent)) for p in parts)]
+                    )
+                    what = f"{bag.relative_to(parent)} next to it has {', '.join(moving)} of the same time"
+                    return f"{what}, which we do not read: merge both by rosbags-convert --src {files} --dst merged"
         return ""
 
     def _is_covered_by(self, trajectory: Trajectory) -> bool:
@@ -237,24 +239,8 @@ class BagLog(Log):
     def _reader(self) -> Any:
         """Return the open bag. Each process opens it itself, also after a fork or unpickling."""
         if self._opened[0] != os.getpid():
-            self._opened = (os.getpid(), self._open(self._files))
+            self._opened = (os.getpid(), _open_bag(self._files))
         return self._opened[1]
-
-    def _open(self, files: list[Path]) -> Any:
-        """Open files as one bag."""
-        rosbags, types = (import_optional(f"rosbags.{name}", _NEED) for name in ("highlevel", "typesys"))
-        for path in files:
-            for file in [path] if path.is_file() else path.iterdir():
-                check_file(file)
-        _check_version(files)
-        # Bags of ROS 2 before Iron do not describe their messages. The types that we read never changed.
-        types_of_old_bags = types.get_typestore(types.Stores.ROS2_HUMBLE)
-        for name in _LIVOX:
-            for kind, definition in (("CustomPoint", _CUSTOM_POINT), ("CustomMsg", _CUSTOM_MSG)):
-                types_of_old_bags.register(types.get_types_from_msg(definition, name.replace("CustomMsg", kind)))
-        reader = rosbags.AnyReader(files, default_typestore=types_of_old_bags)
-        reader.open()
-        return reader
 
     def close(self) -> None:
         """Close the bag. A sweep that is read later opens it again."""
@@ -513,6 +499,23 @@ def _bags_in(folder: Path) -> list[Path]:
     files = [file for file in visible(folder) if file.suffix in (*SUFFIXES, _ACTIVE) and file.is_file()]
     parts = {part for file in files for part in _parts(file)[1:]}
     return [file for file in files if file not in parts]
+
+
+def _open_bag(files: list[Path]) -> Any:
+    """Open files as one bag."""
+    rosbags, types = (import_optional(f"rosbags.{name}", _NEED) for name in ("highlevel", "typesys"))
+    for path in files:
+        for file in [path] if path.is_file() else path.iterdir():
+            check_file(file)
+    _check_version(files)
+    # Bags of ROS 2 before Iron do not describe their messages. The types that we read never changed.
+    types_of_old_bags = types.get_typestore(types.Stores.ROS2_HUMBLE)
+    for name in _LIVOX:
+        for kind, definition in (("CustomPoint", _CUSTOM_POINT), ("CustomMsg", _CUSTOM_MSG)):
+            types_of_old_bags.register(types.get_types_from_msg(definition, name.replace("CustomMsg", kind)))
+    reader = rosbags.AnyReader(files, default_typestore=types_of_old_bags)
+    reader.open()
+    return reader
 
 
 def _parts(path: Path) -> list[Path]:
