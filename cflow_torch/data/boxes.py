@@ -14,7 +14,7 @@ from cflow_torch.errors import warn
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError
 
-_LISTED = 20  # names in a message
+_LISTED = 20  # names in a message, or with one each
 _NO_CATEGORY = "NONE"
 # Metres added to length, width and height of the boxes of t, because annotated boxes are a little too tight.
 _MARGIN = (0.2, 0.2, 0.0)
@@ -55,10 +55,10 @@ def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> list[int
     `names` are the categories of the boxes in their own data set. `known` maps these to categories of Argoverse 2.
     """
     unknown = sorted(set(names) - set(known), key=str)
-    if unknown:
+    for name in unknown[:_LISTED]:  # Python shows each text once
         warn(
-            f"we do not know the categories {shortened(unknown[:_LISTED])} of boxes, so labels have the flow of these "
-            "boxes, but no category, and bucketed scores count their points as background"
+            f"we do not know the category {shortened(name)} of boxes, so labels have the flow of these boxes, but no "
+            "category, and bucketed scores count their points as background"
         )
     return [CATEGORY_INDEX[known.get(name, _NO_CATEGORY)] for name in names]
 

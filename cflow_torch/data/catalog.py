@@ -16,7 +16,7 @@ from typing import Any, Iterator, Mapping, NamedTuple, Sequence, overload
 from cflow_torch.data.deskewing import DeskewedLog, check_deskew
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.finding import FOUND, Finding
-from cflow_torch.data.folders import distinct_names, find_folders, length_of_chain, visible
+from cflow_torch.data.folders import distinct_names, find_folders, levels
 from cflow_torch.data.log import CachedLog, Log, LogWrapper, add_gaps_in_time, typical_sweeps
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
@@ -68,7 +68,7 @@ DATA_SETS: dict[str, DataSet] = {
 }
 _NAMED_BY_PATH = ("arrays", "bags", "kitti", "pandaset")  # logs that have the names of their files or folders
 _OF_LAYOUTS = ("dataset", "sequences", "velodyne")  # folders whose names tell no log from another
-_DEEPEST = 6  # levels below the root that are searched for a mark
+_DEEPEST = 4  # levels of folders below the root, in which we search for a mark
 
 
 class UserSource(NamedTuple):
@@ -104,15 +104,14 @@ def recognise(root: Any) -> str:
     with remote_errors(top):
         if not top.exists():
             raise CFlowError(f"{root}: there is no such file or folder")
-        level, found, marked = [top], [], [top]
-        for _ in range(_DEEPEST + length_of_chain(top)):
+        found, marked = [], []
+        for paths in _paths_below(top):
             marks = [
-                (name, path) for name, one in DATA_SETS.items() for path in level if any(map(path.match, one.marks))
+                (name, path) for name, one in DATA_SETS.items() for path in paths if any(map(path.match, one.marks))
             ]
             found, marked = list(dict.fromkeys(name for name, _ in marks)), [path for _, path in marks]
             if found:
                 break
-            level = [path for folder in level for path in visible(folder)]
     found = [name for name in found if _has_logs(name, root)]  # nuScenes and TruckScenes have the same file names
     if found and _have_clouds(marked, top):  # folders of other data sets may be called so
         errors = {name: _error_of(name, root) for name in found}
@@ -128,6 +127,13 @@ def recognise(root: Any) -> str:
         fits = f"several formats fit, {' and '.join(found)}; {choose}"
         raise CFlowError(f"{root}: {fits if found else _why_nothing_fits(top) or f'no format fits; {choose}'}")
     return found[0]
+
+
+def _paths_below(top: Path) -> Iterator[list[Path]]:
+    """Yield a file or folder, then what is in it, and so on, level by level."""
+    yield [top]
+    for level in levels(top, _DEEPEST):
+        yield [path for _, inside in level for path in inside]
 
 
 def _have_clouds(marked: Sequence[Path], top: Path) -> bool:
@@ -199,13 +205,12 @@ def _why_nothing_fits(top: Path) -> str:
     from cflow_torch.data.arrays.cloud_file import SUFFIXES
     from cflow_torch.data.arrays.cloud_text import SUFFIXES as TEXTS
 
-    level, suffixes = [top], Counter()  # type: ignore[var-annotated]
-    depth = _DEEPEST + length_of_chain(top)
-    for _ in range(depth):
-        suffixes.update(suffix_of(path) or path.suffix for path in level if path.is_file())
-        level = [path for folder in level for path in visible(folder)]
+    suffixes, num_levels = Counter(), 0  # type: ignore[var-annotated]
+    for paths in _paths_below(top):
+        num_levels = num_levels + 1
+        suffixes.update(suffix_of(path) or path.suffix for path in paths if path.is_file())
     if not suffixes:
-        return f"it has no files that you may read, down to {depth - 1} folders below" if top.is_dir() else ""
+        return f"it has no files that you may read, down to {num_levels - 1} folders below" if top.is_dir() else ""
     # Files next to clouds may be more: .json beside .pcap, .txt beside .las.
     known = [kind for kind, _ in suffixes.most_common() if kind in (*_CONVERSIONS, *SUFFIXES)]
     suffix = min(known, key=lambda kind: kind in TEXTS, default="")

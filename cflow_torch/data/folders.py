@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from itertools import islice
 from pathlib import Path
-from typing import Any, Callable, Sequence, TypeVar
+from typing import Any, Callable, Iterator, Sequence, TypeVar
 
 from cflow_torch.data.paths import is_remote, read_bytes
 from cflow_torch.errors import CFlowError
@@ -35,18 +35,33 @@ def search(
         raise CFlowError(f"{root} is not a folder; pass {what}")
     found: list[_T] = []
     clean: list[_T] = []
-    depth = depth + length_of_chain(root)
-    level = [root]
-    for _ in range(depth + 1):
-        children: list[Path] = []
-        for folder in level:
-            inside = visible(folder)
+    for level in levels(root, depth):
+        for folder, inside in level:
             record = "" if folder == root else record_in(inside)
             here = find(folder) if inside and record != _OF_FLOW else []
             (clean if record else found).extend(here)
-            children += [] if here or record else inside
-        level = [child for child in children if is_passed(child) and child.is_dir()]
+            inside[:] = [] if here or record else filter(is_passed, inside)
     return found or clean
+
+
+def levels(root: Path, depth: int) -> Iterator[list[tuple[Path, list[Path]]]]:
+    """Yield the paths of each level, and what is visible in each: the root, then what is in it, and so on.
+
+    There are `depth` levels below the root. Levels with one folder do not count until a level has another number of
+    folders. In a file, nothing is visible. As with `os.walk`, we do not go on to paths that the caller takes out of
+    these lists.
+    """
+    paths, num_free = [root], _LONGEST_CHAIN
+    while depth >= 0:
+        level = [(path, visible(path)) for path in paths]
+        folders = islice((path for _, inside in level for path in inside if path.is_dir()), 2)
+        if num_free > 0 and len(list(folders)) == 1:
+            num_free = num_free - 1
+        else:
+            depth = depth - 1
+            num_free = 0
+        yield level
+        paths = [path for _, inside in level for path in inside]
 
 
 def find_folders(root: Path, is_log: Callable[[Path], bool], depth: int, what: str, **settings: Any) -> list[Path]:
@@ -75,17 +90,6 @@ def visible(folder: Path) -> list[Path]:
         if is_remote(folder):  # there are no credentials
             raise
         return []
-
-
-def length_of_chain(root: Path) -> int:
-    """Return how many folders follow below a folder, each the only one in that before."""
-    folder = root
-    for length in range(_LONGEST_CHAIN):
-        below = list(islice((path for path in visible(folder) if path.is_dir()), 2))
-        if len(below) != 1:
-            return length
-        folder = below[0]
-    return _LONGEST_CHAIN
 
 
 def natural_key(name: str) -> tuple[Any, ...]:

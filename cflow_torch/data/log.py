@@ -384,8 +384,15 @@ def _readable(log: Log, indices: range) -> Iterator[Sweep]:
 
 
 def _may_pass(error: BaseException | None) -> bool:
-    """Test whether the file system caused an error, such as a lost connection. Then the next run may read the sweep."""
-    return error is not None and (isinstance(error, OSError) or _may_pass(error.__cause__))
+    """Test whether the file system caused an error, such as a lost connection. Then the next run may read the sweep.
+
+    Its errors have an `errno`, or are of a connection (h5py passes on those of remote files). An OSError without one is
+    of a library that finds the content damaged, such as gzip.
+    """
+    if error is None:
+        return False
+    is_of_system = isinstance(error, OSError) and error.errno is not None
+    return is_of_system or isinstance(error, (ConnectionError, TimeoutError)) or _may_pass(error.__cause__)
 
 
 def windows(log: Log, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:

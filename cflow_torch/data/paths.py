@@ -6,6 +6,7 @@ of pathlib and the functions below.
 
 from __future__ import annotations
 
+import errno
 import gzip
 import mmap
 import re
@@ -78,15 +79,22 @@ def is_path_like(value: Any) -> bool:
 
 @contextmanager
 def remote_errors(path: Path) -> Iterator[None]:
-    """Turn every exception of a remote file system (no credentials, no connection, a timeout) into an OSError."""
+    """Turn every exception of a remote file system (no credentials, no connection, a timeout) into an OSError.
+
+    It is a ConnectionError or has an `errno`, unlike an OSError of a library that finds a file damaged.
+    """
     try:
         yield
-    except (CFlowError, OSError):
+    except CFlowError:
+        raise
+    except OSError as error:
+        if is_remote(path) and error.errno is None:
+            error.errno = errno.EIO
         raise
     except Exception as error:
         if not is_remote(path):
             raise
-        raise OSError(f"cannot reach {path} ({type(error).__name__}: {error})") from error
+        raise ConnectionError(f"cannot reach {path} ({type(error).__name__}: {error})") from error
 
 
 def exist(*paths: Path) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from pathlib import Path
 from typing import Any, Callable
 
@@ -13,6 +14,7 @@ from tiny_recording import TinyRecording, rigid, turn_z
 from writers.nuscenes import write_nuscenes
 
 from cflow_torch.data.arrays.cloud_file import read_cloud
+from cflow_torch.data.boxes import category_indices
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog, find_nuscenes_scenes
 from cflow_torch.data.nuscenes.tables import Annotations, Tracks
@@ -161,9 +163,16 @@ def test_boxes_of_unknown_categories_have_none(tiny):
     """As those of Lyft Level 5, whose tables have the form of nuScenes'."""
     known = open_log(tiny).labels(0)
     edit(tiny, "category", lambda rows: [{**row, "name": "spaceship"} for row in rows])
-    with pytest.warns(CFlowWarning, match="do not know the categories .*spaceship.* as background"):
+    with pytest.warns(CFlowWarning, match="do not know the category spaceship of .* as background"):
         labels = open_log(tiny).labels(0)
     assert known.category.any() and not labels.category.any() and np.array_equal(labels.flow, known.flow)
+
+
+def test_an_unknown_category_is_said_once(recwarn):
+    warnings.simplefilter("default")
+    for names in (["ufo"], ["car", "ufo", "kite"], ["kite"]):
+        category_indices(names, {"car": "REGULAR_VEHICLE"})
+    assert [str(each.message).split()[6] for each in recwarn] == ["ufo", "kite"]
 
 
 def test_two_scenes_of_one_name_are_an_error(tiny):

@@ -19,6 +19,7 @@ from small_logs import SMALL_LOGS, write_small_log
 from cflow_torch.data import paths
 from cflow_torch.data.atomic import atomic_file, ensure_writable, new_folder, remove_stale
 from cflow_torch.data.catalog import find_sources, open_log
+from cflow_torch.data.log import window
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.types import CFlowError
 
@@ -195,6 +196,28 @@ def test_a_remote_error_costs_one_call(written, far, name, error, monkeypatch):
             read()
     monkeypatch.setattr(Far, "error", None)
     assert np.array_equal(log.sweep(0).points, expected)  # the store is back
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [
+        *(("av2", error) for error in (Unreachable, OSError, PermissionError, ConnectionError, TimeoutError)),
+        *(("hdf5", error) for error in (ConnectionError, TimeoutError)),
+    ],
+)
+def test_a_window_is_not_shorter_because_of_a_lost_connection(written, far, name, error, monkeypatch):
+    monkeypatch.setattr(paths, "_BLOCK", 20_000)
+    monkeypatch.setattr(paths, "_KEPT_BLOCKS", 1)
+    log = open_log(name, find_sources(name, far(written(name)))[0], check=False)
+    count, sweep = len(log.timestamps), log.sweep
+
+    def lost(index: int) -> Any:
+        monkeypatch.setattr(Far, "error", error if index == count - 3 else None)
+        return sweep(index)
+
+    monkeypatch.setattr(log, "sweep", lost)
+    with pytest.raises(CFlowError, match="the store is unreachable"):
+        window(log, count - 2, 1)
 
 
 @pytest.mark.parametrize("error", [Unreachable, KeyboardInterrupt])

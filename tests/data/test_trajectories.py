@@ -224,6 +224,21 @@ def test_a_missing_sweep_shortens_windows_and_fails_its_pairs(tmp_path) -> None:
         window(log, 7, 4)
 
 
+def test_a_compressed_sweep_with_a_wrong_checksum_shortens_windows(tmp_path) -> None:
+    """gzip's error for it is an OSError, but no other run reads the sweep."""
+    for file in list(clouds(tmp_path).glob("*.npy")):
+        content = gzip.compress(file.read_bytes())
+        if file.stem == str(STAMPS[5]):
+            content = content[:-8] + bytes(4) + content[-4:]
+        file.with_name(f"{file.name}.gz").write_bytes(content)
+        file.unlink()
+    log: Log = ArraysLog(tmp_path)
+    with pytest.raises(CFlowError, match="BadGzipFile: CRC check failed"):
+        window(log, 4)
+    with pytest.warns(CFlowWarning, match="windows near sweep 5 are shorter, because .*BadGzipFile: CRC"):
+        assert [sweep.points[0, 0] for sweep in window(log, 7, 4).pch] == [7]
+
+
 def test_a_vehicle_that_stands_has_a_pose_in_every_line(tmp_path: Path) -> None:
     """Lines without times may be equal. Only a line with a time can be a repetition."""
     np.savetxt(tmp_path / "poses.txt", np.tile(np.eye(4)[:3].reshape(12), (4, 1)))

@@ -44,18 +44,44 @@ def _check_number(count: int, header: Mapping[str, Sequence[str]]) -> None:
 
 
 def _text_fields(body: bytes, header: Mapping[str, Sequence[str]]) -> dict[str, np.ndarray]:
-    """Read the fields of a text. Those that are characters, or numbers of another type, are left out, and we say so.
+    """Read the fields of a text. Those that are characters, or numbers of another type, are left out, and we say so."""
+    names, counts = header["FIELDS"], [int(count) for count in header["COUNT"]]
+    columns, needed = _columns(header), _needed(names)
+    rows, num_certain = _rows(body, header)
+    fields, characters = {}, []
+    for k, name in enumerate(names):
+        if counts[k] > 1 or name == "_":
+            continue
+        if k >= num_certain:
+            characters.append(name)
+            continue
+        kind = np.dtype(f"{header['TYPE'][k].lower()}{header['SIZE'][k]}")
+        try:
+            fields[name] = _numbers([words[columns[k]] for words in rows], kind)
+        except OverflowError:
+            if k in needed:
+                raise
+            warn(f"the field {name} of .pcd files has numbers that are not {kind.name}, so we leave it out")
+        except ValueError:
+            if k in needed or kind.itemsize > 1:
+                raise
+            characters.append(name)
+    if characters:
+        warn(f"the fields {', '.join(characters)} of .pcd files hold characters, or follow them, so we leave them out")
+    return fields
+
+
+def _rows(body: bytes, header: Mapping[str, Sequence[str]]) -> tuple[list[list[bytes]], int]:
+    """Return the words of the points of a text, and the number of fields, from the first, that are certain in all rows.
 
     PCL writes fields of one byte as characters, of which some are blanks or ends of lines. Then a row has fewer words,
     and only the fields before are certain. So the first field of one byte must be behind x, y, z: otherwise, a row of
     too few words is an error.
     """
-    names, counts = header["FIELDS"], [int(count) for count in header["COUNT"]]
-    columns = np.cumsum([0, *counts]).tolist()  # of the first value of each field, and the end
-    needed = [k for k, name in enumerate(names) if name.lower() in AXES] or list(range(len(names)))
+    names, columns = header["FIELDS"], _columns(header)
     are_bytes = [size == "1" and name != "_" for size, name in zip(header["SIZE"], names)]
     uncertain = [*are_bytes, True].index(True)  # the first field that may be a blank; others follow
-    if uncertain <= max(needed):
+    if uncertain <= max(_needed(names)):
         uncertain = len(names)
     lines = [line.split() for line in with_plain_nan(body).splitlines() if not line.lstrip().startswith(b"#")]
     rows = [words for words in lines if len(words) >= columns[uncertain]]
@@ -65,28 +91,17 @@ def _text_fields(body: bytes, header: Mapping[str, Sequence[str]]) -> dict[str, 
     are_short = [len(words) < columns[-1] for words in rows]
     if are_short[-1:] == [True] and sum(are_short) == 1:
         raise ValueError("its last line is not complete")
-    num_certain = uncertain if any(are_short) else len(names)
-    fields, left_out = {}, []
-    for k, name in enumerate(names):
-        if counts[k] > 1 or name == "_":
-            continue
-        if k >= num_certain:
-            left_out.append(name)
-            continue
-        kind = np.dtype(f"{header['TYPE'][k].lower()}{header['SIZE'][k]}")
-        try:
-            fields[name] = _numbers([words[columns[k]] for words in rows], kind)
-        except OverflowError as error:
-            if k in needed:
-                raise
-            warn(f"the field {name} of .pcd files is left out: {error}")
-        except ValueError:
-            if k in needed or not are_bytes[k]:
-                raise
-            left_out.append(name)
-    if left_out:
-        warn(f"the fields {', '.join(left_out)} of .pcd files hold characters, or follow them, so we leave them out")
-    return fields
+    return rows, uncertain if any(are_short) else len(names)
+
+
+def _columns(header: Mapping[str, Sequence[str]]) -> list[int]:
+    """Return the column of the first value of each field, and the number of columns."""
+    return np.cumsum([0, *map(int, header["COUNT"])]).tolist()  # type: ignore[no-any-return]
+
+
+def _needed(names: Sequence[str]) -> list[int]:
+    """Return which fields must be readable: x, y, z, or all if there are none."""
+    return [k for k, name in enumerate(names) if name.lower() in AXES] or list(range(len(names)))
 
 
 def _numbers(words: Sequence[bytes], kind: np.dtype[Any]) -> np.ndarray:
@@ -147,7 +162,7 @@ def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
     has_values = [int(count) > 0 for count in columns["COUNT"]]
     columns = {key: [word for word, has in zip(column, has_values) if has] for key, column in columns.items()}
     width, height = words.get("WIDTH") or words["POINTS"], words.get("HEIGHT") or ["1"]
-    if int(width[0]) * int(height[0]) == 0:  # PCL writes so the points of a cloud whose size was not set
+    if int(width[0]) * int(height[0]) == 0:  # PCL writes 0 if the size was not set
         width, height = words.get("POINTS") or width, ["1"]
     size = {"WIDTH": width, "HEIGHT": height}
     rest = {"VIEWPOINT": words.get("VIEWPOINT") or ["0", "0", "0", "1", "0", "0", "0"]}

@@ -109,16 +109,7 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
     if not names and (words.shape[1], len(words) % 4) == (4, 0) and _are_homogeneous(words[3::4]):  # four lines each
         words = words.reshape(-1, 16)
     roles = _roles(names)
-    unnamed = _UNNAMED.get(words.shape[1], ())
-    if unnamed == MATRIX and not (words[:, 15].astype(np.float64) == 1).all() and _are_homogeneous(words[:, 12:]):
-        unnamed = (*MATRIX[:12], *["row"] * 3, "time")
-    if words.shape[1] in (6, 7, 8) and not names and not _are_quaternions(words[:, -4:]):
-        if words.shape[1] > 6 and _are_quaternions(words[:, -7:-3]):
-            unnamed = ("time", *_QUATERNION_FIRST)[8 - words.shape[1] :]
-        elif words.shape[1] < 8:
-            unnamed = _UNNAMED_ANGLES[7 - words.shape[1] :]
-    if unnamed[:1] == ("row",) and not (np.diff(words[:, 0].astype(np.float64)) == 1).all():
-        unnamed = ()  # the first of 9 numbers must count the rows
+    unnamed = _layout(words, bool(names))
     if not roles and (not names or len(unnamed) > 9 or len(names) == len(_TUM)):
         roles = {role: column for column, role in enumerate(unnamed) if role != "row"}
     if not roles:
@@ -146,6 +137,24 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
     if not _TIMES.isdisjoint(roles):
         times = _ascending(path, _nanoseconds(roles, words), "write all digits, and one pose of a time")
     return Trajectory(poses, times, is_kitti, str(path), labels)
+
+
+def _layout(words: np.ndarray, have_names: bool) -> Sequence[str]:
+    """Return what the columns hold by their number and values, if names do not tell it; () = unknown."""
+    count = words.shape[1]
+    usual = _UNNAMED.get(count, ())
+    if count == 9:
+        counts_rows = (np.diff(words[:, 0].astype(np.float64)) == 1).all()
+        return usual if counts_rows else ()
+    if count == 16:
+        ends_with_1 = (words[:, 15].astype(np.float64) == 1).all()
+        has_time = not ends_with_1 and _are_homogeneous(words[:, 12:])
+        return (*MATRIX[:12], *["row"] * 3, "time") if has_time else usual
+    if count not in (6, 7, 8) or have_names or _are_quaternions(words[:, -4:]):
+        return usual
+    if count > 6 and _are_quaternions(words[:, -7:-3]):
+        return ("time", *_QUATERNION_FIRST)[8 - count :]
+    return _UNNAMED_ANGLES[7 - count :] if count < 8 else usual
 
 
 def _are_homogeneous(rows: np.ndarray) -> bool:

@@ -7,7 +7,7 @@ import re
 from contextlib import closing, suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Sequence
 
 import numpy as np
 
@@ -497,7 +497,7 @@ def _bags_in(folder: Path) -> list[Path]:
     if (folder / "metadata.yaml").is_file():
         return [folder]
     files = [file for file in visible(folder) if file.suffix in (*SUFFIXES, _ACTIVE) and file.is_file()]
-    parts = {part for file in files for part in _parts(file)[1:]}
+    parts = {part for file in files for part in _parts(file, files)[1:]}
     return [file for file in files if file not in parts]
 
 
@@ -518,33 +518,37 @@ def _open_bag(files: list[Path]) -> Any:
     return reader
 
 
-def _parts(path: Path) -> list[Path]:
-    """Return the paths that rosbags must open for a bag."""
+def _parts(path: Path, files: Sequence[Path] | None = None) -> list[Path]:
+    """Return the paths that rosbags must open for a bag. `files` are those next to it; None = we list them."""
     if path.is_dir():
         description = path / "metadata.yaml"
         text = description.read_text("utf-8", "replace") if description.is_file() else ""
         named = re.findall(r"^\s*- (\S+\.(?:db3|mcap))\s*$", text, re.MULTILINE)
         if all((path / name).is_file() for name in named):
             return [path]
-        files = [file for file in visible(path) if file.suffix in SUFFIXES]  # renamed since
-        return sorted(files, key=_part_number) or [path]
+        renamed = [file for file in visible(path) if file.suffix in SUFFIXES]
+        return sorted(renamed, key=_part_number) or [path]
     match = _PART.fullmatch(path.stem)
     if match is None or int(match[2]) != 0:
         return [path]
     parts = [path]
-    for file in _parts_after(path):
+    for file in _parts_after(path, list(path.parent.glob("*")) if files is None else files):
         if _part_number(file) == len(parts):
             parts.append(file)
     return parts
 
 
-def _parts_after(path: Path) -> list[Path]:
-    """Return the files that may be parts of the bag with this first part, in the order of their numbers."""
+def _parts_after(path: Path, files: Sequence[Path]) -> list[Path]:
+    """Return which files may be parts of the bag with this first part, in the order of their numbers.
+
+    They start with the first part or later, but before the first part of the next recording of this name.
+    """
     name, first = _recording(path)
-    others = [file for file in path.parent.glob(f"*{path.suffix}") if _PART.fullmatch(file.stem)]
+    others = [file for file in files if file.name.endswith(path.suffix) and _PART.fullmatch(file.stem)]
     starts = {file: start for file in others for each, start in [_recording(file)] if each == name}
     later = [start for file, start in starts.items() if _part_number(file) == 0 and start > first]
-    after = [file for file, start in starts.items() if start >= first and not any(start >= each for each in later)]
+    end = min(later, default=None)
+    after = [file for file, start in starts.items() if first <= start and (end is None or start < end)]
     numbers = [_part_number(file) for file in after]
     # Two files of one number are of two recordings at a time, if their names have times.
     return sorted((file for file in after if not first or numbers.count(_part_number(file)) == 1), key=_part_number)
