@@ -184,18 +184,11 @@ class BagLog(Log):
         bags = [bag for folder in folders for bag in _bags_in(folder) if not bag.samefile(self.path)]
         for bag in sorted(bags)[:_MOST_OTHERS]:
             parts = _parts(bag)
-            # Any error of a library is ignored, because nobody has given this file.
-            with suppress(Exception), closing(_open_bag(parts)) as reader:
-                if reader.start_time > max(arrived) or reader.end_time < min(arrived):
-                    continue
-                kinds = {each.topic: each.msgtype for each in reader.connections}
-                moving = sorted(topic for topic, kind in kinds.items() if kind in _MOVING and topic != "/tf_static")
-                if moving:
-                    files = " ".join(
-                        [*(file.name for file in self._files), *(str(p.relative_to(parent)) for p in parts)]
-                    )
-                    what = f"{bag.relative_to(parent)} next to it has {', '.join(moving)} of the same time"
-                    return f"{what}, which we do not read: merge both by rosbags-convert --src {files} --dst merged"
+            moving = _topics_of_poses(parts, min(arrived), max(arrived))
+            if moving:
+                files = " ".join([*(file.name for file in self._files), *(str(p.relative_to(parent)) for p in parts)])
+                what = f"{bag.relative_to(parent)} next to it has {', '.join(moving)} of the same time"
+                return f"{what}, which we do not read: merge both by rosbags-convert --src {files} --dst merged"
         return ""
 
     def _is_covered_by(self, trajectory: Trajectory) -> bool:
@@ -516,6 +509,16 @@ def _open_bag(files: list[Path]) -> Any:
     reader = rosbags.AnyReader(files, default_typestore=types_of_old_bags)
     reader.open()
     return reader
+
+
+def _topics_of_poses(files: list[Path], first_ns: int, last_ns: int) -> list[str]:
+    """Return the topics of a bag that have poses or moving transforms, if it has messages between two times."""
+    # Any error of a library is ignored, because nobody has given these files.
+    with suppress(Exception), closing(_open_bag(files)) as reader:
+        if reader.start_time <= last_ns and reader.end_time >= first_ns:
+            kinds = {each.topic: each.msgtype for each in reader.connections}
+            return sorted(topic for topic, kind in kinds.items() if kind in _MOVING and topic != "/tf_static")
+    return []
 
 
 def _parts(path: Path, files: Sequence[Path] | None = None) -> list[Path]:
