@@ -15,26 +15,29 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
-from cflow_torch.ops.indices import constant, flat_nonzero, split_index, take_columns
+from cflow_torch.ops.indices import constant, draw, flat_nonzero, floor_divide, split_index, take_columns
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
 _NEAR = 0.5  # metres, rows and columns to a moving pixel
+_BESIDE = 1.6  # metres, side of a block
 _LOWEST = 10  # centimetres above the mean of the ground around; lower points are ground
 
 
 def find_low_points(sweeps: HeightSlicedSweeps, is_moving: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the points of t that are not drawn, but near a moving pixel.
+    """Find the points of t that are not drawn, but beside a moving object.
 
     Args:
         is_moving: (P',) bool, of the pixels.
 
     Returns:
         row: (K,) int64, row of each of these points in the batch.
-        pixel: (K,) int64, the nearest moving pixel of t, at most half a metre away in y and in x.
+        pixel: (K,) int64, the nearest moving pixel of t, at most half a metre away in y and in x. P' + 1 = there is
+            none, or the point is less than 0.1 m above the ground.
 
-    Convention: distances are those between the pixels. Ties: the first pixel in raster order.
+    Convention: a point is beside an object if the object has a pixel of t in the block of 1.6 m of the point, or in one
+    of the eight blocks around. Distances are those between the pixels. Ties: the first pixel in raster order.
 
-    Cost: for each point that is not drawn, but at least 0.1 m above the ground, 121 lookups if a pixel is 0.1 m large.
+    Cost: for each of these points that is at least 0.1 m above the ground, 121 lookups if a pixel is 0.1 m large.
     """
     batch = sweeps.batch
     row = flat_nonzero(batch.is_active & batch.has_result & ~sweeps.points.is_member)
@@ -42,20 +45,32 @@ def find_low_points(sweeps: HeightSlicedSweeps, is_moving: Tensor) -> tuple[Tens
         return row[:0], row[:0]
     window, step = split_index(batch.image.index_select(0, row).long(), sweeps.num_steps)
     position = take_columns(batch.positions, row)
+    cell = torch.stack(sweeps.grid.row_col(position)).long()
+    beside = flat_nonzero((step == 1) & _are_beside(sweeps, is_moving, window, cell))
+    row, window, position, cell = row[beside], window[beside], position[:, beside], cell[:, beside]
+    pixel = torch.full_like(row, sweeps.num_pixels + 1)
     is_above = 100 * position[2] >= batch.ground.at(position, window, batch.ground.mean() + _LOWEST)
-    low = flat_nonzero(is_above & (step == 1))
-    row, window, position = row[low], window[low], position[:, low]
+    above = flat_nonzero(is_above)
     offset = _nearest_first(sweeps.grid.whole_pixels(_NEAR), row.device)  # [2, M, 1]
-    pixel = torch.empty_like(row)
-    for some in chunks(0, len(row), row.device, offset.shape[1]):
-        cell = torch.stack(sweeps.grid.row_col(position[:, some])).long()[:, None] + offset  # [2, M, L]
-        pixel[some] = _first_moving(sweeps, is_moving, window[some], cell)
-    found = flat_nonzero(pixel < sweeps.num_pixels)
-    return row[found], pixel[found]
+    for some in chunks(0, len(above), row.device, offset.shape[1]):
+        point = above[some]
+        pixel[point] = _first_moving(sweeps, is_moving, window[point], cell[:, None, point] + offset)
+    return row, pixel
+
+
+def _are_beside(sweeps: HeightSlicedSweeps, is_moving: Tensor, window: Tensor, cell: Tensor) -> Tensor:
+    """Tell which of K points, with windows, (K,) int64, and cells, (2, K) int64, are beside an object, (K,) bool."""
+    side = sweeps.grid.whole_pixels(_BESIDE)
+    lattice = sweeps.grid.lattice(side, border=1)
+    movers = sweeps.pixels[flat_nonzero(is_moving & (sweeps.pixels.step == 1))]
+    block = lattice.cell(movers.window, *floor_divide(movers.row_col, side))
+    around = (block + lattice.square(1, block.device)).view(-1)
+    is_beside = draw(around, sweeps.batch.num_windows * lattice.area)
+    return is_beside.index_select(0, lattice.cell(window, *floor_divide(cell, side)))
 
 
 def _first_moving(sweeps: HeightSlicedSweeps, is_moving: Tensor, window: Tensor, cell: Tensor) -> Tensor:
-    """Return the first moving pixel of t in the cells of each of L points, (L,) int64; P' = none.
+    """Return the first moving pixel of t in the cells of each of L points, (L,) int64; P' + 1 = none.
 
     `window` is (L,) int64, and `cell`, (2, M, L) int64, has rows and columns.
     """
@@ -63,7 +78,7 @@ def _first_moving(sweeps: HeightSlicedSweeps, is_moving: Tensor, window: Tensor,
     moves = pixels.spread(is_moving, none=False).view(cell.shape[1:])
     first = moves.byte().argmax(0, keepdim=True)
     pixel = pixels.of_item.view(cell.shape[1:]).gather(0, first)[0]
-    return torch.where(moves.any(0), pixel, sweeps.num_pixels)
+    return torch.where(moves.any(0), pixel, sweeps.num_pixels + 1)
 
 
 def _nearest_first(reach: int, device: torch.device) -> Tensor:

@@ -3,7 +3,7 @@
 
   python scripts/ablation/calibrate_confidence.py fit           writes verified/confidence.json, two passes
   python scripts/ablation/calibrate_confidence.py fit-objects   the same, only the rows of objects with a motion
-  python scripts/ablation/calibrate_confidence.py fit-low       the same, only the row of points that are not drawn
+  python scripts/ablation/calibrate_confidence.py fit-low       the same, only the bin of points that are not drawn
   python scripts/ablation/calibrate_confidence.py evaluate      Argoverse 2 pair, KITTI 0000, PandaSet, simulated drives
 
 The windows come from sets.py. We fit on pairs (h = 0) and history (h = 4) of five sensors, region +-70 m, without
@@ -180,15 +180,14 @@ def main() -> None:
     if given.task != "evaluate":
         items = list(simulated(SEEDS, MOTORWAYS))
         if given.task != "fit-low":
-            first_bin = confidence.Bins.unmeasured if given.task == "fit" else confidence.Bins.moving
+            first_bin = confidence.Bins.unknown + 1 if given.task == "fit" else confidence.Bins.moving
             for _ in range(2):  # P(moving) decides which objects move, and so which points are right
                 for name, values in fit(statistics(items, (0, HISTORY), MAX_POINTS)).items():
                     confidence.TABLE[name][first_bin:] = values[first_bin:]
         if given.task != "fit-objects":
-            low = confidence.Bins.left_out
             real = [*pair, *sets.kitti(sets.KITTI)[HISTORY:], *sets.kitti(sets.PANDASET["a1"])[HISTORY:]]
             for name, values in fit(statistics([*items, *real], (0, HISTORY), MAX_POINTS)).items():
-                confidence.TABLE[name][low] = values[low]
+                confidence.TABLE[name][confidence.Bins.left_out] = values[confidence.Bins.left_out]
         TABLE_FILE.write_text(json.dumps(confidence.TABLE) + "\n", encoding="utf-8")
         return
     kitti = [item for path in (sets.KITTI, sets.KITTI_LATER) for item in sets.kitti(path)[HISTORY:]]

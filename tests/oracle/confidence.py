@@ -106,13 +106,13 @@ def probabilities(
     Given are the object of each pixel, the motion of each object and the result of `margin`, the missing pixels, and
     the dilated component of each pixel at the second finest scale, then at the finest.
 
-    The bins of the table: left out; static in a pair and biased; static in an unmatched component, by its size; static,
-    by the share of the slices in the block around that is found; static beside an object with a motion; of such an
-    object, see `margin`. Each but the first two has rows, for pairs, then with history: one if unmatched, two if
-    static, not missing and missing, and four of objects, near slow, near fast, far slow, far fast. A block is 1.6 m
-    wide, and its slices are found if t+1 has them where they move to. A pixel is unmatched if t+1 lacks a slice around
-    it. In pairs it is then missing. A component is unmatched if less than an eighth of its size is matched, the sum of
-    the reach of its pixels of t. A missing pixel in one has a bin of that kind.
+    The bins of the table: left out; unknown; static in a pair and biased; static in an unmatched component, by its
+    size; static, by the share of the slices in the block around that is found; static beside an object with a motion;
+    of such an object, see `margin`. Each but the first three has rows, for pairs, then with history: one if unmatched,
+    two if static, not missing and missing, and four of objects, near slow, near fast, far slow, far fast. A block is
+    1.6 m wide, and its slices are found if t+1 has them where they move to. A pixel is unmatched if t+1 lacks a slice
+    around it. In pairs it is then missing. A component is unmatched if less than an eighth of its size is matched, the
+    sum of the reach of its pixels of t. A missing pixel in one has a bin of that kind.
     """
     motion = np.array([*(each.flow[::-1] for each in rigid), (0.0, 0.0)])[object_of] / sweeps.size
     step, row, col = sweeps.pixels.T

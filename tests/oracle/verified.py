@@ -81,6 +81,7 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
         low = np.setdiff1d(np.flatnonzero(clouds[0].is_active & is_inside), drawn[1])
         is_dynamic = np.array([*(is_moving for _, is_moving in margins), False])  # the last one is of no object
         near = pixels_of_low_points(sweeps, points[low], is_dynamic[object_of], ground, config)
+        confidence[low[near == -2]], moving[low[near == -2]] = TABLE["probabilities"][1], TABLE["moving"][1]
         rows, pixels = np.append(rows, low[near >= 0]), np.append(pixels, near[near >= 0])
     confidence[rows], moving[rows] = of_pixels[:, pixels]
     ids[rows] = object_of[pixels]

@@ -32,7 +32,7 @@ def test_the_tables_are_monotone_and_the_oracle_reads_them():
     table = confidence.TABLE
     sizes, shares, margins = (len(table[name]) + 1 for name in ("size", "share", "margin"))
     for name, falls in (("probabilities", False), ("moving", True)):
-        assert table[name][confidence.Bins.unmeasured] == 0.5
+        assert table[name][confidence.Bins.unknown] == 0.5
         start = 2 + len(table["bias"])
         biased = table[name][2:start]
         assert biased == sorted(biased, reverse=not falls)
