@@ -9,7 +9,7 @@ from typing import Any, Callable, Collection, Iterator, NamedTuple, Sequence
 import numpy as np
 
 from cflow_torch.data.log import Log, known_poses, poses_beyond
-from cflow_torch.diagnosis.conventions import MARGIN, OFF, STILL, TIMES, WORLD
+from cflow_torch.diagnosis.conventions import EQUAL, MARGIN, OFF, STILL, TIMES, WORLD
 from cflow_torch.diagnosis.inspection import repeats
 from cflow_torch.diagnosis.other_frame import motion_of
 from cflow_torch.diagnosis.pair import GIVEN, Pair, difference, make_pair
@@ -130,11 +130,13 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     jumps = _jumps(log)
     chosen = choose_pairs(len(log.timestamps), poses, jumps)
     make_pairs = partial(_make_pairs, log, poses, deskew)
-    if log.surrounds_poses:
-        judgement = judge(make_pairs(chosen, (OFF,), True))
-        if WORLD in judgement.best:
-            return judgement
     judgement = judge(make_pairs(chosen, scans, False))
+    if log.surrounds_poses:
+        in_world = judge(make_pairs(chosen, (OFF,), True))
+        # Points near the origin may lie around both, and other readings fit better. Still is the same transform.
+        is_as_good = STILL in judgement.best or not in_world.fits < EQUAL * judgement.fits
+        if WORLD in in_world.best and is_as_good:
+            return in_world
     hardly_moves = poses is not None and _hardly_move(poses)
     if poses is not None and _does_not_fit(judgement, hardly_moves):  # are only a few sweeps wrong?
         pairs = _pairs_without_repeats(log, poses, jumps, ()) or chosen  # all may repeat the one before

@@ -102,6 +102,27 @@ class Thinned(LogWrapper):
         return replace(sweep, points=sweep.points[::3], is_ground=sweep.is_ground[::3])
 
 
+class Walls(Log):
+    """A slow drive between smooth walls, along which all motions fit about equally, with poles in front of them."""
+
+    def __init__(self, num_sweeps=8):
+        self.log_id, self.timestamps = "walls", [100_000_000 * index for index in range(num_sweeps)]
+        self.poses = np.stack([as_matrix(np.eye(3), (0.55 * index, 0, 0)) for index in range(num_sweeps)])
+        random = np.random.default_rng(0)
+        self.poles = np.column_stack([random.uniform(-40, 45, 40), random.choice([-5, 5], 40)])
+
+    def sweep(self, index):
+        random = np.random.default_rng(index)
+        wall = random.uniform((-40, -0.02, -1.5), (40, 0.02, 3), (5000, 3)) + [0, 7, 0]
+        wall[::2, 1] *= -1
+        angle = random.uniform(0, 2 * np.pi, 3500)
+        shaft = np.column_stack([np.cos(angle), np.sin(angle), random.uniform(-15, 30, 3500)]) / 10
+        shaft[:, :2] += self.poles[random.integers(0, 40, 3500)] - self.poses[index, :2, 3]
+        ground = random.uniform((-30, -6, -1.7), (30, 6, -1.7), (3000, 3))
+        points = np.concatenate([wall, shaft, ground]).astype(np.float32)
+        return Sweep(points, np.arange(len(points)) >= 8500, self.poses[index], self.timestamps[index])
+
+
 @lru_cache(maxsize=None)
 def drive_of(seed=2, num_sweeps=12, profile="demo", scene="street"):
     """Seed 2 of the street begins to turn in its first second."""
@@ -309,6 +330,13 @@ def test_points_in_the_frame_of_the_first_sweep_are_found_and_moved_back(drive):
         assert np.allclose(log.sweep(9).points, drive.sweep(9).points, atol=1e-3)
         steps = [np.linalg.inv(each.poses[9]) @ each.poses[3] for each in (log, drive)]
         assert np.allclose(*steps, atol=1e-6)
+
+
+def test_points_near_the_first_pose_are_in_the_world_only_if_no_other_reading_fits_better():
+    """Between walls, much is in place without the poses, and the points lie around the vehicle and the first pose."""
+    left = Wrong(Walls(), poses=each(POSES["left"]))
+    assert left.surrounds_poses and judge_log(Walls()).best == ()
+    assert "left" in judge_log(left).best
 
 
 def test_a_mounting_that_one_pair_shows_weakly_is_not_named():
