@@ -23,9 +23,7 @@ CAMERA, MOUNT = "camera", "mount"
 MARGIN = 1.3  # share in place over that as given, from which a reading is clearly better
 EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
 _SMALL = 1.1  # the same of small mistakes, which make a small difference
-# Vehicles of the same speed stand still without the ego motion: up to 1.56. Mirrored axes change little on a straight
-# road: up to 0.99 for right poses.
-_OF_STILL, _OF_MIRRORED = 1.7, 1.15
+_OF_MIRRORED = 1.15  # mirrored axes change little on a straight road: up to 0.99 for right poses
 LATEST = 10  # sweeps
 _TURN = 2 * np.pi + 1e-3  # larger azimuths are degrees
 AXES = {  # ego_T_stored of frames with other axes: x, y and z of the stored frame, as columns
@@ -197,7 +195,6 @@ READINGS: dict[str, Reading] = {
     STILL: Reading(
         "the static world stands still without the poses, so they are of another log, or the points are compensated",
         _still,
-        margin=_OF_STILL,
     ),
     **TIMES_OF_POSES,
     "steps": Reading("the poses are steps (each is that of a sweep in the frame of the sweep before)", _joined),
@@ -229,7 +226,7 @@ READINGS: dict[str, Reading] = {
         "the quaternions of the poses begin with w, but were read with w last", _reordered((1, 2, 3, 0))
     ),
     "w_last": Reading("the quaternions of the poses end with w, but were read with w first", _reordered((3, 0, 1, 2))),
-    **{name: Reading(f"the poses are in {name}", scaled(unit), margin=_OF_STILL) for name, unit in UNITS.items()},
+    **{name: Reading(f"the poses are in {name}", scaled(unit)) for name, unit in UNITS.items()},
     **{
         f"points_{name}": Reading(f"the points are in {name}", of_points=_of_axes(unit * np.eye(3)))
         for name, unit in UNITS.items()

@@ -9,8 +9,8 @@ from typing import Callable, Sequence
 import numpy as np
 
 from cflow_torch.diagnosis.conventions import MOUNTS, OFF, READINGS, REVERSED, SCAN_READINGS, STILL, TIMES, UNITS, WORLD
-from cflow_torch.diagnosis.stillness import FEWEST_POINTS, Structure, cell_keys, structure_rows
-from cflow_torch.transforms import as_matrix, rigid_transform
+from cflow_torch.diagnosis.stillness import FEWEST_POINTS, Structure, structure_rows
+from cflow_torch.transforms import as_matrix, rigid_transform, transform_points
 from cflow_torch.types import Array, Sweep, as_numpy
 
 GIVEN = "as given"
@@ -23,6 +23,7 @@ _MOST_AROUND = 5000  # points that tell what they lie around
 _TIMED_POINTS = 6000  # to compare points with times, moved and as they are: the better of both is used
 _NEAR_GIVEN = 0.7  # share of a reading over that as given
 _BLOCK, _FEWEST_BLOCKS = 5.0, 12  # metres; structure in fewer blocks may be a few moving objects
+_CLEAR_COUNT, _CLEAR_SHARE = 1, 0.1  # more points of a block in place than this are clearly more
 LEAST_MOTION, ARM = 0.2, 20.0  # metres; poses that move points 20 m away by less do not show anything
 LEAST_DISTANCE = 3.0  # metres between pose and origin, to tell whose surroundings points are
 _LEAST_DIFFERENCE = 0.05  # metres; a pair shows only the readings that move these points otherwise by this
@@ -68,6 +69,19 @@ class Pair:
         rivals = [name for name, share in shares.items() if share >= _NEAR_GIVEN * shares[GIVEN]]
         return {**shares, **self._shares(rivals, scan, MOST_POINTS)}
 
+    def blocks(self, reading: str, scan: str) -> np.ndarray:
+        """Count the blocks of 5 m in which clearly more is in place as given, and under a reading: (2,) int64."""
+        source = self.source.points(scan)[:MOST_POINTS]
+        structure = self.target.structure(scan)
+        given, read = (
+            structure.in_place(transform_points(source, self.transforms[name])).astype(np.int64)
+            for name in (GIVEN, reading)
+        )
+        _, block, count = np.unique(_blocks(source), return_inverse=True, return_counts=True)
+        gain = np.bincount(block.ravel(), read - given)
+        least = np.maximum(_CLEAR_COUNT, _CLEAR_SHARE * count)
+        return np.array([(-gain > least).sum(), (gain > least).sum()])
+
     def among(self, readings: Sequence[str]) -> Pair:
         """Return the pair with these readings of the poses, and that as given."""
         kept = {name: T for name, T in self.transforms.items() if name in (GIVEN, *readings)}
@@ -108,7 +122,8 @@ def make_pair(
         in_world = has_poses and is_around(pc1.points, poses[1])
     centre = poses[1, :3, 3] if in_world else np.zeros(3)
     rows_of = [structure_rows(sweep, centre) for sweep in (pc0, pc1)]
-    if min(map(len, rows_of)) < FEWEST_POINTS or _num_blocks(_as_it_is(pc0, rows_of[0], OFF)) < _FEWEST_BLOCKS:
+    num_blocks = len(np.unique(_blocks(_as_it_is(pc0, rows_of[0], OFF))))
+    if min(map(len, rows_of)) < FEWEST_POINTS or num_blocks < _FEWEST_BLOCKS:
         return None
     rows_of[0] = rows_of[0][: _TIMED_POINTS if TIMES in scans else MOST_POINTS]
     clouds = [_cloud(*each, centre) for each in zip((pc0, pc1), rows_of, deskew)]
@@ -163,11 +178,9 @@ def difference(T: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.linalg.norm(apart[..., :3, 3], axis=-1) + ARM * rotation  # type: ignore[no-any-return]
 
 
-def _num_blocks(points: np.ndarray) -> int:
-    """Return how many blocks of 5 m in the plane hold points."""
-    block = np.floor(points / _BLOCK).astype(np.int64)
-    block[:, 2] = 0
-    return len(np.unique(cell_keys(block)))
+def _blocks(points: np.ndarray) -> np.ndarray:
+    """Return the key of the block of 5 m in the plane that holds each point, (N,) int64."""
+    return np.floor(points[:, :2] / _BLOCK).astype(np.int64) @ np.array((1 << 20, 1))  # type: ignore[no-any-return]
 
 
 def _about(centre: np.ndarray, T: np.ndarray) -> np.ndarray:

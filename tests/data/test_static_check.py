@@ -105,22 +105,22 @@ class Thinned(LogWrapper):
 class Walls(Log):
     """A slow drive between smooth walls, along which all motions fit about equally, with poles in front of them."""
 
-    def __init__(self, num_sweeps=8):
-        self.log_id, self.timestamps = "walls", [100_000_000 * index for index in range(num_sweeps)]
-        self.poses = np.stack([as_matrix(np.eye(3), (0.55 * index, 0, 0)) for index in range(num_sweeps)])
+    def __init__(self, step=0.55):
+        self.log_id, self.timestamps = "walls", [100_000_000 * index for index in range(8)]
+        self.poses = np.stack([as_matrix(np.eye(3), (step * index, 0, 0)) for index in range(8)])
         random = np.random.default_rng(0)
-        self.poles = np.column_stack([random.uniform(-40, 45, 40), random.choice([-5, 5], 40)])
+        self.poles = np.column_stack([random.uniform(-40, 45, 80), random.choice([-5, 5], 80)])
 
     def sweep(self, index):
         random = np.random.default_rng(index)
         wall = random.uniform((-40, -0.02, -1.5), (40, 0.02, 3), (5000, 3)) + [0, 7, 0]
         wall[::2, 1] *= -1
-        angle = random.uniform(0, 2 * np.pi, 3500)
-        shaft = np.column_stack([np.cos(angle), np.sin(angle), random.uniform(-15, 30, 3500)]) / 10
-        shaft[:, :2] += self.poles[random.integers(0, 40, 3500)] - self.poses[index, :2, 3]
+        angle = random.uniform(0, 2 * np.pi, 8000)
+        shaft = np.column_stack([np.cos(angle), np.sin(angle), random.uniform(-15, 30, 8000)]) / 10
+        shaft[:, :2] += self.poles[random.integers(0, 80, 8000)] - self.poses[index, :2, 3]
         ground = random.uniform((-30, -6, -1.7), (30, 6, -1.7), (3000, 3))
         points = np.concatenate([wall, shaft, ground]).astype(np.float32)
-        return Sweep(points, np.arange(len(points)) >= 8500, self.poses[index], self.timestamps[index])
+        return Sweep(points, np.arange(len(points)) >= 13000, self.poses[index], self.timestamps[index])
 
 
 @lru_cache(maxsize=None)
@@ -292,6 +292,23 @@ def test_positions_of_another_scale_are_named_with_the_factor(drive, factor):
     (problem,) = find_problems(Wrong(drive, poses=scaled(factor)))
     found = re.search(r"positions multiplied by ([0-9.]+)", problem)
     assert found and abs(float(found[1]) * factor - 1) < 0.04
+
+
+@pytest.mark.parametrize("factor", [0.5, 2])
+def test_positions_of_another_scale_are_named_beside_smooth_walls(factor):
+    """There, two fifths of what fits under the right motion are in place under any."""
+    (problem,) = find_problems(Wrong(Walls(), poses=scaled(factor)))
+    assert f"{factor} times as long as the motion" in problem
+
+
+def test_poses_that_drift_while_the_vehicle_stands_are_told():
+    def drift(poses):
+        shift = np.random.default_rng(0).normal(0, 0.08, (8, 3)).cumsum(0) * (1, 1, 0)
+        return as_matrix(poses[:, :3, :3], shift)
+
+    (problem,) = find_problems(Wrong(Walls(step=0), poses=drift))
+    assert "stands still without the poses" in problem and "data.poses=null" in problem
+    assert find_problems(Walls(step=0)) == []
 
 
 @pytest.mark.parametrize("sweeps", [5, pytest.param(-3, marks=pytest.mark.slow)])
