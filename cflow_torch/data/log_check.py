@@ -322,7 +322,11 @@ def _repeated(log: _CheckedLog) -> list[Finding]:
     if repeats(*first):
         text = "sweep 1 repeats the points of sweep 0: leave one out, or copy its file again"
         return [Finding("sweeps", WRONG, text, True)]
-    is_known = _is_grid(first[0]) or bool(log.frame[0])  # then "to the millimetre" means nothing
+    spacing = _spacing_of_grid(first[0])
+    if spacing > IN_PLACE and not log.frame[0]:
+        text = f"the points lie on a grid of {spacing:.2g} m, so static objects seem to move by as much"
+        return [Finding("sweeps", WRONG, f"{text}: give points as measured, such as one of each voxel", True)]
+    is_known = spacing > 0 or bool(log.frame[0])  # then "to the millimetre" means nothing
     again = 0.0 if is_known else _share_again(*first)
     if again > _ACCUMULATED:
         text = f"{100 * again:.0f} % of the points of the first sweep are also in the second one, to the millimetre"
@@ -362,11 +366,15 @@ def _share_again(pc0: Sweep, pc1: Sweep) -> float:
     return Structure(scale * points1[around]).share(scale * moved, np.eye(4))
 
 
-def _is_grid(sweep: Sweep) -> bool:
-    """Test whether a sweep was thinned to a grid: most points have an x that others have, too."""
+def _spacing_of_grid(sweep: Sweep) -> float:
+    """Return the metres between points of a grid to which a sweep was thinned or rounded; 0 = they lie on none.
+
+    On a grid, most points have an x that others have.
+    """
     points = as_numpy(sweep.points)
     x = points[:: len(points) // _MOST_SEEN + 1, 0]
-    return len(np.unique(x)) < _GRID * len(x)
+    different = np.unique(x)
+    return float(np.median(np.diff(different))) if 1 < len(different) < _GRID * len(x) else 0.0
 
 
 def _shared_directions(pc0: Sweep, pc1: Sweep) -> float:

@@ -42,6 +42,7 @@ INACCURATE, NO_READING = "inaccurate", "none"
 _OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading has at most, or half of what this has
 # After a shift along the path (metres), the share must be smaller by this factor: along smooth walls it is not.
 _SHIFT, _PEAK = 0.15, 1.2
+_BESIDE = 1.5  # least share as given over that half a metre beside, if sweeps fit: 2.9 to 4; if not, 1.2
 _TURN = 1.1  # share of a direction over that of its opposite, from which other starts of its turn are compared
 # Traffic stays in place without the ego motion, or under one that is shorter by so many metres, or by half: up to 2.5
 # times the share as given, if the poses are right. But traffic fills few places, and the static world fits better as
@@ -56,7 +57,8 @@ _UNCLEAR = 0.15  # share under the best reading of fast sweeps, below which they
 # Share under the motions that fit best over that as given, from which other motions are compared; if poses and points
 # are right, up to 1.13.
 _FREE = 1.1
-# Metres of such a motion from that of the poses: less is within the cells of the search, more is no error of measurement.
+# Metres of such a motion from that of the poses. Less is within the cells of the search, more is no error of
+# measurement.
 _SMALLEST_ERROR, _LARGEST_ERROR = 0.08, 1.5
 _HOPELESS = 0.04  # share as given, below which nothing fits
 _SEARCHED = 0.4  # share as given, below which we look for an unknown motion
@@ -69,7 +71,7 @@ class Judgement:
     shares: dict[str, float]  # reading -> 0 ... 1; empty = nothing could be compared
     best: tuple[str, ...] = ()  # readings of the poses that fit clearly better than as given; equal ones together
     found: Mapping[str, Reading] = field(default_factory=dict)  # readings that follow from these points
-    free: float = float("nan")  # share of structure in place under the motions that fit best
+    is_peak: bool = False  # the share as given is clearly larger than half a metre beside
     scan: str = ""  # the scan under which this holds; "" = not compared
     shares_of_scans: Mapping[str, float] = field(default_factory=dict)
     is_sparse: bool = False  # the sweeps have so few points that hardly any is measured again
@@ -86,8 +88,11 @@ class Judgement:
 
     @property
     def is_low(self) -> bool:
-        """Whether less of the structure is in place as given than in sweeps that fit, and no reading is better."""
-        return not self.best and self.given < LEAST_SHARE
+        """Whether less of the structure is in place as given than in sweeps that fit, and no reading is better.
+
+        Sweeps of few or noisy points have small shares, but these are larger than beside.
+        """
+        return not self.best and self.given < LEAST_SHARE and not self.is_peak
 
     def reading(self, name: str) -> Reading:
         """Return what a reading means."""
@@ -124,8 +129,9 @@ def _judge(usable: Sequence[Pair]) -> Judgement:
     fast = [pair for pair in moving if len(pair.scans) > 1]
     scan, shares_of_scans = _best_scan(fast) if fast else (moving[0].scans[0], {})
     judgement = _judge_poses(moving, scan)
-    if judgement.best in ((NO_READING,), (INACCURATE,)):  # the sweeps may be skewed and the poses be of another frame
-        scans = [each for each in DIRECTIONS if fast and each in fast[0].scans]
+    is_unclear = judgement.best in ((NO_READING,), (INACCURATE,)) or judgement.fits < _UNCLEAR
+    if fast and is_unclear:  # the sweeps may be skewed and the poses be of another frame
+        scans = [each for each in DIRECTIONS if each in fast[0].scans and each != scan]
         named = [each for each in (_judge_poses(moving, scan) for scan in scans) if each.fits > _TURN * judgement.fits]
         judgement = max(named, key=lambda each: each.fits, default=judgement)
     return replace(judgement, shares_of_scans=shares_of_scans if judgement.scan == scan else {})
@@ -137,16 +143,18 @@ def _judge_poses(moving: Sequence[Pair], scan: str) -> Judgement:
     found: dict[str, Reading] = {}
     motions = [motion_of(pair, scan) for pair in moving]
     fitted = [replace(pair, transforms={GIVEN: motion}) for pair, motion in zip(moving, motions)]
-    free = float(np.mean([pair.share(scan) for pair in fitted]))
+    free = np.mean([pair.share(scan) for pair in fitted])
+    given = np.mean([each[GIVEN] for each in of_pairs])
     is_in_world = any(WORLD in each for each in of_pairs)
-    if not is_in_world and free > _FREE * np.mean([each[GIVEN] for each in of_pairs]):
+    if not is_in_world and free > _FREE * given:
         found, others = _compare_motions(moving, scan, motions)
         of_pairs = [{**each, **other.shares_of_poses(scan)} for each, other in zip(of_pairs, others)]
         moving = [
             replace(pair, transforms={**pair.transforms, **other.transforms}) for pair, other in zip(moving, others)
         ]
     shares, clear = _compare(of_pairs)
-    judgement = Judgement(shares, found=found, scan=scan, free=free)
+    is_peak = bool(given > _BESIDE * np.mean([pair.share_beside(scan) for pair in moving]))
+    judgement = Judgement(shares, found=found, scan=scan, is_peak=is_peak)
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
         return replace(judgement, best=(WORLD,))
     clear = [name for name in clear if not _may_be_traffic(name, moving, scan)]
@@ -167,7 +175,7 @@ def _may_be_traffic(name: str, pairs: Sequence[Pair], scan: str) -> bool:
     given, read = (np.mean([np.linalg.norm(pair.transforms[each][:3, 3]) for pair in shown]) for each in (GIVEN, name))
     if given - read < min(_SHORTER, given / 2):
         return False
-    num_given, num_read = sum(pair.blocks(name, scan) for pair in shown)
+    num_given, num_read = np.sum([pair.blocks(name, scan) for pair in shown], axis=0)
     return bool(num_given >= _OF_BLOCKS * num_read)
 
 
@@ -291,7 +299,7 @@ def _best_of(pairs: Sequence[Pair], expected: str, others: Sequence[str]) -> tup
     not so.
     """
     of_pairs = [pair.shares_of_scans((expected, *others)) for pair in pairs]
-    shares, clear = _compare(of_pairs, expected)
+    shares, clear = _compare(of_pairs, expected, LEAST_SHARE / 2)
     if expected == TIMES and OFF in others:
         return max(shares, key=shares.__getitem__), shares  # ties: the times
     best, *opposite = sorted(others, key=shares.__getitem__, reverse=True)
@@ -301,7 +309,7 @@ def _best_of(pairs: Sequence[Pair], expected: str, others: Sequence[str]) -> tup
         of_first = pairs[0].shares_of_scans(starts)
         starts = [start for start in starts if start == best or of_first[start] > of_first[best]]
         of_pairs = [{**pair.shares_of_scans(starts), **each} for pair, each in zip(pairs, of_pairs)]
-        of_starts, clear = _compare(of_pairs, expected)
+        of_starts, clear = _compare(of_pairs, expected, LEAST_SHARE / 2)
         _, better = _compare([{start: each[start] for start in starts} for each in of_pairs], best)
         clear = clear[:1] if best not in clear else [*better, best]
         shares.update({scan: of_starts[scan] for scan in clear[:1]})
@@ -332,7 +340,9 @@ def _judge_motion(pairs: Sequence[Pair]) -> Judgement:
     return Judgement(shares, tuple(clear), {UNKNOWN: moves})
 
 
-def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tuple[dict[str, float], list[str]]:
+def _compare(
+    of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN, least: float = LEAST_SHARE
+) -> tuple[dict[str, float], list[str]]:
     """Compare the shares of readings over the pairs that show them.
 
     A reading is clearly better than as given if it is so in the mean, and better in each pair that shows it. It may be
@@ -350,7 +360,7 @@ def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tup
         share, as_given = np.mean([(each.get(name, each[given]), each[given]) for each in of_pairs], axis=0)
         shares[name] = float(share)
         gains[name] = float(share / max(as_given, 1e-9))
-        if share >= LEAST_SHARE and all(each[name] > each[given] for each in of_pairs if name in each):
+        if share >= least and all(each[name] > each[given] for each in of_pairs if name in each):
             better.append(name)
     others = {INACCURATE: Reading("", margin=_OF_ERRORS)}
     known = {name: {**others, **COMPARED}.get(name, Reading("")) for name in better}

@@ -114,6 +114,32 @@ def test_a_lidar_that_turns_the_other_way_is_found() -> None:
     assert log.scan == "counterclockwise"
 
 
+class Changed(LogWrapper):
+    """A log whose points and their times are changed."""
+
+    def __init__(self, log: Log, change: Any) -> None:
+        super().__init__(log)
+        self.change = change
+
+    def sweep(self, index: int) -> Sweep:
+        sweep = self.log.sweep(index)
+        return Sweep(self.change(np.asarray(sweep.points)), None, sweep.pose, sweep.timestamp_ns)
+
+
+def test_a_direction_and_a_reading_of_the_poses_are_found_together(data_root: Path) -> None:
+    file = data_root / "kitti-raw" / "kitti-raw-0027-empty16.h5"
+    if not file.exists():
+        pytest.skip(f"needs {file.name}")
+    log = pytest.importorskip("cflow_torch.data.hdf5").HDF5Log(file)
+    mirrored = DeskewedLog(Changed(log, lambda points: points[:, :3] * np.float32([1, -1, 1])))
+    assert mirrored.scan.startswith("counterclockwise") and mirrored.judgement.best == ("mirrored",)
+
+
+def test_the_direction_is_found_if_few_points_are_measured_again(raw: Drive) -> None:
+    few = DeskewedLog(Changed(Untimed(raw), lambda points: points[::4]))
+    assert few.scan == "clockwise" and few.judgement.given < 0.1 and not few.judgement.is_low
+
+
 @pytest.mark.parametrize(
     ("start", "deskew", "reading"),
     [(90.0, "auto", "clockwise_left"), (0.0, "clockwise_ahead", "clockwise_ahead")],

@@ -25,7 +25,7 @@ from cflow_torch.diagnosis.conventions import AXES, CAMERA, UNITS, WORLD
 from cflow_torch.diagnosis.inspection import mask_problem
 from cflow_torch.diagnosis.other_frame import mounting
 from cflow_torch.diagnosis.pair import GIVEN
-from cflow_torch.diagnosis.readings import NO_READING, UNKNOWN, _compare
+from cflow_torch.diagnosis.readings import NO_READING, UNKNOWN, Judgement, _compare
 from cflow_torch.errors import MissingFile
 from cflow_torch.simulator import make_drive
 from cflow_torch.transforms import (
@@ -439,11 +439,16 @@ def test_two_sweeps_that_do_not_fit_are_told(drive, poses):
     assert text.startswith("the sweeps fit under no reading (only 0.00 of the static structure is in place)")
 
 
-def test_a_share_below_that_of_sweeps_that_fit_is_told(drive):
-    rng = np.random.default_rng(0)
-    noisy = Wrong(drive, lambda points, _: points + rng.normal(0, 0.08, points.shape))
-    assert 0.04 < judge_log(noisy).given < 0.1 and not judge_log(noisy).best
-    assert "no reading" in find_problems(noisy)[0]
+def test_a_small_share_is_told_unless_it_is_larger_than_beside(drive):
+    random = np.random.default_rng(0)
+    noisy = Wrong(drive, lambda points, _: points + random.normal(0, 0.08, points.shape))
+    assert 0.04 < judge_log(noisy).given < 0.1 and find_problems(noisy) == [], "the poses are right"
+    assert Judgement({GIVEN: 0.05}).is_low
+
+
+def test_points_at_the_centres_of_voxels_are_told(drive):
+    (problem,) = find_problems(Wrong(drive, lambda points, _: np.floor(points / 0.2) * 0.2 + 0.1))
+    assert "grid of 0.2 m" in problem
 
 
 @pytest.mark.parametrize(
