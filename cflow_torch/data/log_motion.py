@@ -144,9 +144,10 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
         if _does_not_fit(judgement, hardly_moves):
             others = _pairs_without_repeats(log, poses, jumps, {index for pair in pairs for index in pair})
             prepared = [pair for pair in make_pairs(others, scans, False) if pair is not None]
-            if _fit_as_given(prepared, judgement):
+            if judgement.is_small or _fit_as_given(prepared, judgement):
                 again = judge(prepared)
-                judgement = again if _contradicts(again, judgement) else judgement
+                confirmed = judgement.confirmed_by(again) if again.shares else judgement
+                judgement = again if _contradicts(again, judgement) else confirmed
     is_unclear = not judgement.best and judgement.given < _UNCLEAR
     if is_unclear and hardly_moves:
         spread = choose_pairs(len(log.timestamps), None)

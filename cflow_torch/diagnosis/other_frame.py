@@ -65,8 +65,11 @@ def mounting(rotation: np.ndarray, place: np.ndarray) -> Reading:
         told = rotations_about(2, yaw)
         degrees = np.degrees(yaw)
         side = "left" if degrees > 0 else "right"
-        causes.append(f"the points' x axis points about {abs(degrees):.0f} degrees to the {side} of the poses'")
-        fixes.append(f"a rotation of about {degrees:.0f} degrees about z")
+        decimals = int(abs(degrees) < 5)
+        causes.append(
+            f"the points' x axis points about {abs(degrees):.{decimals}f} degrees to the {side} of the poses'"
+        )
+        fixes.append(f"a rotation of about {degrees:.{decimals}f} degrees about z")
     elif turn_of(rotation) > 0:
         names = [_direction(row) for row in rotation]
         if names == [same for same, _ in _DIRECTIONS]:

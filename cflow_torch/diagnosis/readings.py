@@ -15,6 +15,7 @@ import numpy as np
 from cflow_torch.diagnosis.conventions import (
     AXES,
     EQUAL,
+    MARGIN,
     MIRRORED,
     MOUNT,
     MOUNTS,
@@ -36,7 +37,7 @@ from cflow_torch.windows.deskewing import DIRECTIONS, INSTANTS, SCANS
 STEPS = ("steps", "steps_back")
 HALVES = ("half_late", "half_early")
 # Readings that are no conventions: they follow from the points.
-UNKNOWN, MOUNTED, SCALED = "unknown", "mounted", "scaled"
+UNKNOWN, MOUNTED, SLIGHT, SCALED = "unknown", "mounted", "slightly turned", "scaled"
 INACCURATE, NO_READING = "inaccurate", "none"
 
 _OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading has at most, or half of what this has
@@ -50,7 +51,7 @@ _TURN = 1.1  # share of a direction over that of its opposite, from which other 
 _SHORTER, _OF_BLOCKS = 2.0, 0.15
 _OF_ERRORS = 1.2  # least share with another motion in each pair over that as given
 _EXCUSE = 1.1  # share with another motion in each pair over that of a reading with a name
-_SLIGHT, _OBLIQUE = np.radians((2, 10))  # least angles between axes that are turned and those as given, or with a name
+_OBLIQUE = np.radians(10)  # least angle between axes and those with a name
 _RESCALED = 1.05  # least factor between motions of another scale
 _OF_UNIT = 1.5  # largest factor between a scale, which is not exact, and that of a unit, which the points then confirm
 _UNCLEAR = 0.15  # share under the best reading of fast sweeps, below which they may be skewed, too
@@ -71,6 +72,7 @@ class Judgement:
     shares: dict[str, float]  # reading -> 0 ... 1; empty = nothing could be compared
     best: tuple[str, ...] = ()  # readings of the poses that fit clearly better than as given; equal ones together
     found: Mapping[str, Reading] = field(default_factory=dict)  # readings that follow from these points
+    free: float = float("nan")  # share in place under the motions that fit best
     is_peak: bool = False  # the share as given is clearly larger than half a metre beside
     scan: str = ""  # the scan under which this holds; "" = not compared
     shares_of_scans: Mapping[str, float] = field(default_factory=dict)
@@ -93,6 +95,28 @@ class Judgement:
         Sweeps of few or noisy points have small shares, but these are larger than beside.
         """
         return not self.best and self.given < LEAST_SHARE and not self.is_peak
+
+    @property
+    def is_small(self) -> bool:
+        """Whether a small mistake is named."""
+        return any(map(_is_small, self.best))
+
+    def confirmed_by(self, again: Judgement) -> Judgement:
+        """Return the judgement without small mistakes that other pairs do not show.
+
+        Noise may fit one of them by chance, and poses are then inaccurate.
+        """
+        others = {name.partition(" ")[0] for name in again.best}  # any mounting confirms one
+        names = [
+            name
+            for name in self.best
+            if not _is_small(name)
+            or name.partition(" ")[0] in others
+            or again.shares.get(name, 0) >= MARGIN * again.given
+        ]
+        if names or not self.free >= _FREE * self.given:
+            return replace(self, best=tuple(names))
+        return replace(self, best=(INACCURATE,), shares={**self.shares, INACCURATE: self.free})
 
     def reading(self, name: str) -> Reading:
         """Return what a reading means."""
@@ -143,7 +167,7 @@ def _judge_poses(moving: Sequence[Pair], scan: str) -> Judgement:
     found: dict[str, Reading] = {}
     motions = [motion_of(pair, scan) for pair in moving]
     fitted = [replace(pair, transforms={GIVEN: motion}) for pair, motion in zip(moving, motions)]
-    free = np.mean([pair.share(scan) for pair in fitted])
+    free = float(np.mean([pair.share(scan) for pair in fitted]))
     given = np.mean([each[GIVEN] for each in of_pairs])
     is_in_world = any(WORLD in each for each in of_pairs)
     if not is_in_world and free > _FREE * given:
@@ -153,8 +177,8 @@ def _judge_poses(moving: Sequence[Pair], scan: str) -> Judgement:
             replace(pair, transforms={**pair.transforms, **other.transforms}) for pair, other in zip(moving, others)
         ]
     shares, clear = _compare(of_pairs)
-    is_peak = bool(given > _BESIDE * np.mean([pair.share_beside(scan) for pair in moving]))
-    judgement = Judgement(shares, found=found, scan=scan, is_peak=is_peak)
+    is_peak = bool(given > max(_HOPELESS, _BESIDE * np.mean([pair.share_beside(scan) for pair in moving])))
+    judgement = Judgement(shares, found=found, scan=scan, free=free, is_peak=is_peak)
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
         return replace(judgement, best=(WORLD,))
     clear = [name for name in clear if not _may_be_traffic(name, moving, scan)]
@@ -189,9 +213,10 @@ def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...
         return (INACCURATE,)
     best = [name for name in named if shares[name] >= EQUAL * shares[named[0]]]
     # Right-handed ones first; in turns, a slight rotation is as good as another position.
-    best.sort(key=lambda name: (name in MIRRORED) + 2 * (name == MOUNTED))
-    best = [name for name in best if name in (SCALED, MOUNTED) or _is_small(name) == _is_small(best[0])]
-    if any(name in READINGS for name in best):  # a convention says more than a number
+    best.sort(key=lambda name: (name in MIRRORED) + 2 * (name in (MOUNTED, SLIGHT)))
+    best = [name for name in best if name in (SCALED, MOUNTED, SLIGHT) or _is_small(name) == _is_small(best[0])]
+    # A convention says more than a number. But on a straight road, several remove a slight turn by chance.
+    if any(name in READINGS for name in best):
         best = [name for name in best if name not in (SCALED, MOUNTED)]
     kinds = (MOUNT, *MOUNTS), TIMES_OF_POSES
     others = [name for kind in kinds for name in [name for name in best if name in kind][1:]]
@@ -216,8 +241,9 @@ def _compare_motions(
     steps = [pair.transforms[GIVEN] for pair in pairs]
     errors = [float(np.linalg.norm((motion - step)[:2, 3])) for motion, step in zip(motions, steps)]
     found = _readings_of_motions(pairs, scan, motions)
+    farthest = max(float(difference(motion, step)) for motion, step in zip(motions, steps))
     found[INACCURATE] = Reading(
-        f"the poses are off, by up to {max(errors):.1f} m between two sweeps",
+        f"the poses are off, by up to {farthest:.1f} m between two sweeps for points 20 m away",
         fix="exact poses and times, or data.odometry=refine if they are noisy",
     )
     read = []
@@ -251,10 +277,10 @@ def _readings_of_motions(pairs: Sequence[Pair], scan: str, motions: Sequence[np.
         names = [name for name, known in AXES.items() if name in READINGS and np.array_equal(axes.T, known)]
         if place.any() or not names:
             found[MOUNTED] = mounting(rotation, place)
-    elif turn_of(rotation) > _SLIGHT:
+    elif turn_of(rotation) * lengths[0].max() > _SMALLEST_ERROR:
         is_better = np.linalg.norm(given - fitted @ rotation.T, axis=1) < np.linalg.norm(given - fitted, axis=1)
         if is_better.all():  # not only in turns
-            found[MOUNTED] = mounting(rotation, np.zeros(3))
+            found[SLIGHT] = mounting(rotation, np.zeros(3))
     if not is_turned and np.linalg.norm((fitted - given)[:, :2], axis=1).max() > _SMALLEST_ERROR:
         found[MOUNT] = mounting(axes, place_of(pairs, scan, axes))
     if lengths[1].max() < LEAST_MOTION:  # the vehicle stands
