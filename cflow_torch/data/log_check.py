@@ -240,12 +240,14 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     has_poses = log.sweep(0).pose is not None
     if has_poses and judgement.best and checked.misfit:
         return checked.misfit
-    if NO_READING in judgement.best and has_poses:
-        fitting, share = _fitting(log, (REVERSED, *_UNITS_OF_POINTS))
+    if has_poses and judgement.best:
+        candidates = [unit for unit in UNITS if reading == f"points_{unit}"]  # poses may have the unit of the points
+        candidates += (REVERSED, *_UNITS_OF_POINTS) if NO_READING in judgement.best else ()
+        fitting, share = _fitting(log, candidates)
         if fitting:
             shares = f"{judgement.given:.2f} of the static structure is in place as given, {share:.2f} then"
             text = f"{READINGS[fitting].cause} ({shares}): give {_setting(log, fitting)}"
-            return [Finding("ego motion" if fitting == REVERSED else "frame", WRONG, text, True)]
+            return [Finding("frame" if fitting in _UNITS_OF_POINTS else "ego motion", WRONG, text, True)]
     if not judgement.best:
         text = f"{judgement.given:.2f} of the static structure is in place some sweeps later"
         return [Finding("ego motion", RIGHT, text + ("" if has_poses else ", without poses"), True)]

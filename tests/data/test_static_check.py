@@ -311,6 +311,14 @@ def test_poses_that_drift_while_the_vehicle_stands_are_told():
     assert find_problems(Walls(step=0)) == []
 
 
+def test_poses_of_a_vehicle_that_stands_have_the_unit_of_the_points():
+    def shaken(poses):
+        return as_matrix(poses[:, :3, :3], np.random.default_rng(0).normal(0, 8, (8, 3)))
+
+    problems = find_problems(Wrong(Walls(step=0), lambda points, _: 1000 * points, shaken))
+    assert problems[-1].endswith("give data.read_as=[points_millimetres,millimetres]")
+
+
 @pytest.mark.parametrize("sweeps", [5, pytest.param(-3, marks=pytest.mark.slow)])
 def test_poses_that_are_several_sweeps_late_are_named_with_their_number(turning, sweeps):
     wrong = Wrong(turning, poses=extrapolated(-sweeps))
