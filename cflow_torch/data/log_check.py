@@ -292,7 +292,8 @@ def _lapses(log: _CheckedLog) -> list[Finding]:
         else f"the poses jump by {each.metres:.1f} m before sweep {each.sweep}"
         for each in wrong
     ]
-    fix = "correct it, or remove the sweep; for a jump, give poses of a continuous frame (odometry, not the map)"
+    fix = "correct it, remove the sweep, or give data.odometry=refine if the poses are noisy"
+    fix += "; for a jump, give poses of a continuous frame (odometry, not the map)"
     return [Finding("poses", WRONG, f"{', '.join(texts)}: {fix}", True)]
 
 
@@ -450,7 +451,8 @@ def _misplaced(log: _CheckedLog, neighbours: Neighbours) -> list[Finding]:
             continue
         if last < first:
             what = f"sweeps {last} and {first} do not fit each other, while those around do"
-            fix = "are sweeps missing between them, or do poses jump? Give the parts as logs of their own"
+            fix = "are sweeps missing between them, or do poses jump? Give the parts as logs of their own, or"
+            fix += " data.odometry=refine if the poses are noisy"
         else:
             what = f"sweep {first} does" if first == last else f"sweeps {first} to {last} do"
             what += " not fit those around"

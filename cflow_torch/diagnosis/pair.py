@@ -23,7 +23,6 @@ _MOST_AROUND = 5000  # points that tell what they lie around
 _TIMED_POINTS = 6000  # to compare points with times, moved and as they are: the better of both is used
 _NEAR_GIVEN = 0.7  # share of a reading over that as given
 _BLOCK, _FEWEST_BLOCKS = 5.0, 12  # metres; structure in fewer blocks may be a few moving objects
-_BESIDE = 0.5 * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])  # metres
 _CLEAR_COUNT, _CLEAR_SHARE = 1, 0.1  # more points of a block in place than this are clearly more
 LEAST_MOTION, ARM = 0.2, 20.0  # metres; poses that move points 20 m away by less do not show anything
 LEAST_DISTANCE = 3.0  # metres between pose and origin, to tell whose surroundings points are
@@ -59,12 +58,6 @@ class Pair:
         T = self.transforms[GIVEN].copy()
         T[:3, 3] *= 1 + shift / max(float(np.linalg.norm(T[:3, 3])), 1e-9)
         return self.target.structure(scan).share(self.source.points(scan)[:count], T)
-
-    def share_beside(self, scan: str) -> float:
-        """Return the mean share in place as given, moved by half a metre ahead, back, and to both sides."""
-        T = np.tile(self.transforms[GIVEN], (4, 1, 1))
-        T[:, :2, 3] += _BESIDE
-        return float(self.target.structure(scan).shares(self.source.points(scan)[:MOST_POINTS], T).mean())
 
     def shares_of_scans(self, scans: Sequence[str]) -> dict[str, float]:
         count = _TIMED_POINTS if TIMES in scans else MOST_POINTS

@@ -43,7 +43,7 @@ INACCURATE, NO_READING = "inaccurate", "none"
 _OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading has at most, or half of what this has
 # After a shift along the path (metres), the share must be smaller by this factor: along smooth walls it is not.
 _SHIFT, _PEAK = 0.15, 1.2
-_BESIDE = 1.5  # least share as given over that half a metre beside, if sweeps fit: 2.9 to 4; if not, 1.2
+_BESIDE, _OF_BESIDE = 0.5, 1.5  # metres, and share as given over that so far along the path: if sweeps fit, 2.5 to 4
 _TURN = 1.1  # share of a direction over that of its opposite, from which other starts of its turn are compared
 # Traffic stays in place without the ego motion, or under one that is shorter by so many metres, or by half: up to 2.5
 # times the share as given, if the poses are right. But traffic fills few places, and the static world fits better as
@@ -73,7 +73,7 @@ class Judgement:
     best: tuple[str, ...] = ()  # readings of the poses that fit clearly better than as given; equal ones together
     found: Mapping[str, Reading] = field(default_factory=dict)  # readings that follow from these points
     free: float = float("nan")  # share in place under the motions that fit best
-    is_peak: bool = False  # the share as given is clearly larger than half a metre beside
+    is_peak: bool = False  # the share as given is clearly larger than half a metre farther
     scan: str = ""  # the scan under which this holds; "" = not compared
     shares_of_scans: Mapping[str, float] = field(default_factory=dict)
     is_sparse: bool = False  # the sweeps have so few points that hardly any is measured again
@@ -92,7 +92,7 @@ class Judgement:
     def is_low(self) -> bool:
         """Whether less of the structure is in place as given than in sweeps that fit, and no reading is better.
 
-        Sweeps of few or noisy points have small shares, but these are larger than beside.
+        Sweeps of few or noisy points have small shares, but these are larger than half a metre farther.
         """
         return not self.best and self.given < LEAST_SHARE and not self.is_peak
 
@@ -177,7 +177,8 @@ def _judge_poses(moving: Sequence[Pair], scan: str) -> Judgement:
             replace(pair, transforms={**pair.transforms, **other.transforms}) for pair, other in zip(moving, others)
         ]
     shares, clear = _compare(of_pairs)
-    is_peak = bool(given > max(_HOPELESS, _BESIDE * np.mean([pair.share_beside(scan) for pair in moving])))
+    beside = np.mean([pair.share(scan, shift=_BESIDE) for pair in moving])
+    is_peak = bool(given > max(_HOPELESS, _OF_BESIDE * beside))
     judgement = Judgement(shares, found=found, scan=scan, free=free, is_peak=is_peak)
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
         return replace(judgement, best=(WORLD,))
