@@ -18,7 +18,6 @@ from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.paths import read_bytes, suffix_of
-from cflow_torch.transforms import ROUNDING
 
 _FEWEST_NUMBERS = 7  # of a pose
 COMMENTS = ("#", "%", "//")
@@ -26,7 +25,6 @@ COMMENTS = ("#", "%", "//")
 MATRIX = tuple(f"m{k}" for k in range(16))
 """Names of the entries of a matrix, row by row or column by column; the last four may be missing."""
 # Numbers in a list of a JSON file, and the role that the name of the list has -> endings of their names, else 0, 1, ...
-_PLACE, _FOUR = ("x", "y", "z"), ("q0", "q1", "q2", "q3")  # of lists of seven; w is the first of four or the last
 _VECTORS: dict[Any, Sequence[Any]] = {(3, "x"): ("x", "y", "z"), (3, "qx"): ("roll", "pitch", "yaw")}
 
 
@@ -132,7 +130,7 @@ def tables_of_values(content: bytes, path: Path) -> Iterator[Table]:
             continue
         texts = labels or [_text_of(member) for member in members]
         words = np.array([[row.get(name, "nan") for name in names] for row in rows], str)
-        yield Table(_name_sevens(list(names), words), words, texts if len({*texts, ""}) > len(texts) else [])
+        yield Table(list(names), words, texts if len({*texts, ""}) > len(texts) else [])
 
 
 def _value_of(content: bytes, path: Path) -> Any:
@@ -200,27 +198,6 @@ def _numbers_of(value: Any, name: str) -> Iterator[tuple[str, str]]:
     elif isinstance(value, dict):
         for key, member in value.items():
             yield from _numbers_of(member, f"{name}.{key}" if name else key)
-
-
-def _name_sevens(names: list[str], words: np.ndarray) -> list[str]:
-    """Return the names of columns, and name those of lists of seven numbers: a position and a quaternion, or reversed.
-
-    The quaternion has length 1 in most rows. If both ends have, it is the one that varies less.
-    """
-    named = list(names)
-    for name in [name for name in names if name == "0" or name.endswith(".0")]:
-        columns = [names.index(f"{name[:-1]}{k}") for k in range(7) if f"{name[:-1]}{k}" in names]
-        if len(columns) != 7 or f"{name[:-1]}7" in names:
-            continue
-        values = words[:, columns].astype(np.float64)
-        values = values[np.isfinite(values).all(axis=1)]
-        fours = {start: values[:, start : start + 4] for start in (3, 0)}
-        units = [k for k, four in fours.items() if (np.abs(np.linalg.norm(four, axis=1) - 1) < ROUNDING).mean() > 0.5]
-        if len(values) and units:
-            start = min(units, key=lambda k: float(fours[k].std(axis=0).sum()))
-            for column, found in zip(columns, (*_PLACE, *_FOUR) if start else (*_FOUR, *_PLACE)):
-                named[column] = found
-    return named
 
 
 def _text_of(value: Any) -> str:
