@@ -28,11 +28,14 @@ def search(
 
     We do not search below folders in which something is found, in hidden folders, in folders of flow that we computed,
     or in folders for which `is_passed` is False. Clean logs that we wrote count only if there are no others. A chain of
-    folders below the root, each alone, costs no depth. A root that is not a folder is a `CFlowError`, which says `what`
-    to pass.
+    folders below the root, each alone, costs no depth. A root that is a file is a `CFlowError`, which says `what` to
+    pass, unless `find` returns something for it.
     """
     if not root.is_dir():
-        raise CFlowError(f"{root} is not a folder; pass {what}")
+        of_file = list(find(root)) if root.is_file() else []
+        if not of_file:
+            raise CFlowError(f"{root} is not a folder; pass {what}")
+        return of_file
     found: list[_T] = []
     clean: list[_T] = []
     for level in levels(root, depth):

@@ -19,7 +19,7 @@ from cflow_torch.data.folders import search, visible
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
 from cflow_torch.data.point_times import find_times
-from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
+from cflow_torch.data.trajectory import Trajectory
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep
@@ -68,10 +68,7 @@ def find_bags(root: PathLike) -> list[Path]:
     drive_1.bag, ... are the parts of one bag, also if the time of each part is in its name. The bag is called by its
     first part, and `BagLog` opens them all.
     """
-    root = as_path(root)
-    if root.is_file():
-        return [root]
-    return sorted(search(root, _bags_in, SEARCH_DEPTH, "a bag, or a folder of bags"))
+    return sorted(search(as_path(root), _bags_in, SEARCH_DEPTH, "a bag, or a folder of bags"))
 
 
 class BagLog(Log):
@@ -124,7 +121,7 @@ class BagLog(Log):
             raise CFlowError(
                 f"{self.path} is a recording that was not finished: run rosbag reindex, then rename it .bag"
             )
-        self.poses: np.ndarray | None = None
+        self.poses = None
         self._opened: tuple[int, Any] = (0, None)
         self._mount = None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         hint = f"is it a complete bag of ROS 1 (.bag), ROS 2 (folder) or MCAP? {_REPAIR}"
@@ -137,7 +134,7 @@ class BagLog(Log):
             self._check_count(f"{self.path}: {self.topic}")
             trajectory = self._find_poses(topics, poses, tracks)
             if trajectory is not None:
-                self._use_poses(trajectory)
+                self._use_poses(trajectory, f"{self.path}: {self.topic}, while there are poses,")
             self._period = float(np.median(np.diff(self.timestamps))) * 1e-9
             self.lidar_position = self._mount_at(self.timestamps[0])[:3, 3]
 
@@ -171,7 +168,8 @@ class BagLog(Log):
             return Trajectory(matrices, times, False, f"{source} of {self.path}")
         if poses is None:
             return None
-        near = find_poses_near(self.path.parent, self.log_id, self.timestamps, self._is_covered_by, self._note)
+        fits: Any = lambda trajectory: trajectory.covers(self.timestamps)
+        near = find_poses_near(self.path.parent, self.log_id, self.timestamps, fits, self._note)
         if near is None:
             self._note(self._other_bag_with_poses())
         return near
@@ -190,17 +188,6 @@ class BagLog(Log):
                 what = f"{bag.relative_to(parent)} next to it has {', '.join(moving)} of the same time"
                 return f"{what}, which we do not read: merge both by rosbags-convert --src {files} --dst merged"
         return ""
-
-    def _is_covered_by(self, trajectory: Trajectory) -> bool:
-        return trajectory.covers(self.timestamps)
-
-    def _use_poses(self, trajectory: Trajectory) -> None:
-        """Take poses with times, and keep the sweeps that have one."""
-        self.trajectory = np.asarray(trajectory.times_ns), trajectory.poses
-        self.poses, is_covered, note = fit_to_sweeps(trajectory, self.timestamps)
-        self._note(note)
-        self.has_sparse_poses = trajectory.is_sparse(self.timestamps)
-        self._keep(is_covered, f"{self.path}: {self.topic}, while there are poses,")
 
     def _mount_at(self, time: int) -> np.ndarray:
         """Return `T_ego_lidar` at a time, (4, 4) float64."""
@@ -487,7 +474,7 @@ def _check_version(files: list[Path]) -> None:
 
 
 def _bags_in(folder: Path) -> list[Path]:
-    if (folder / "metadata.yaml").is_file():
+    if folder.is_file() or (folder / "metadata.yaml").is_file():
         return [folder]
     files = [file for file in visible(folder) if file.suffix in (*SUFFIXES, _ACTIVE) and file.is_file()]
     parts = {part for file in files for part in _parts(file, files)[1:]}

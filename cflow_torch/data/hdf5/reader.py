@@ -13,7 +13,7 @@ import numpy as np
 from cflow_torch.data.arrays.cloud_file import in_single
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.folders import visible
+from cflow_torch.data.folders import search, visible
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, source_for_random_access
@@ -37,17 +37,11 @@ def find_hdf5_scenes(root: PathLike) -> list[Path]:
 
     A missing path is a `CFlowError`.
     """
-    root = as_path(root)
-    if root.is_file():
-        return [root]
-    if not root.is_dir():
-        raise CFlowError(f"{root} is neither a file nor a folder; pass a scene (.h5) or a folder of scenes")
-    below = [path for folder in visible(root) for path in visible(folder)]
-    return sorted(_scenes(visible(root))) or sorted(_scenes(below))
+    return sorted(search(as_path(root), _scenes_in, 1, "a scene (.h5), or a folder of scenes"))
 
 
-def _scenes(paths: Sequence[Path]) -> list[Path]:
-    return [path for path in paths if path.suffix == ".h5"]
+def _scenes_in(folder: Path) -> list[Path]:
+    return [folder] if folder.is_file() else [path for path in visible(folder) if path.suffix == ".h5"]
 
 
 class HDF5Log(Log):

@@ -93,7 +93,7 @@ class KITTILog(ArraysLog):
         if is_auto and not is_sequence:
             trajectory = self._poses_of_oxts() if _kitti360(root) is None else self._poses_of_kitti360()
         if trajectory is not None:
-            self.poses = self._pose_per_sweep(trajectory, list(self.timestamps) if self._has_times else None)
+            self._take_poses(trajectory)
             self._frames = [int(file.stem) for file in self.files]
             self.gaps |= frozenset(self._gaps_in_numbers())
 

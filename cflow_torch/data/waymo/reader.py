@@ -48,8 +48,6 @@ def find_waymo_segments(root: PathLike) -> list[Path]:
     Files of version 1 are a `CFlowError`.
     """
     root = as_path(root)
-    if root.is_file() and root.suffix != ".tfrecord":
-        return [root]
     what = "<split>/lidar/<segment>.parquet, or a split"
     root = root.parent if root.name == "lidar" else root
     if root.suffix == ".tfrecord" or next(root.glob("*.tfrecord"), None):
@@ -61,7 +59,8 @@ def find_waymo_segments(root: PathLike) -> list[Path]:
 
 
 def _segments_of(split: Path) -> list[Path]:
-    return [path for path in visible(split / "lidar") if path.suffix == ".parquet"]
+    files = [path for path in visible(split / "lidar") if path.suffix == ".parquet"]
+    return [split] if split.is_file() else files
 
 
 class WaymoLog(BoxLog):
