@@ -102,6 +102,15 @@ class HDF5Log(Log):
         points = self._values(index, "lidar")[:, :3]
         points = points if points.dtype == np.float64 else points.astype(np.float32)
         is_missing = missing_returns(points) | (np.abs(points) > np.finfo(np.float32).max).any(axis=1)
+        time = None if self.timestamps[-1] < _FIRST_MICROSECOND else timestamp  # None: the groups are numbered
+        times = self._values(index, "lidar_dt", rows)
+        if times is not None and np.abs(times).max(initial=0) > _LONGEST_LAG:  # of another unit or clock
+            period = None if time is None else float(np.median(np.diff(self.timestamps))) * 1e-9
+            found = find_times({"time": times}, time, period, self._note, is_missing)
+            times = None if found is None else found.seconds
+            is_missing |= False if found is None else found.is_stray
+        elif times is not None:
+            times = times.astype(np.float32)
         if is_missing.any():
             points = np.where(is_missing[:, None], points.dtype.type(np.nan), points)
         is_ground = self._values(index, "ground_mask", rows, np.bool_)
@@ -113,25 +122,9 @@ class HDF5Log(Log):
             )
         if pose is not None and not np.array_equal(self.ego_T_lidar, np.eye(4)):
             pose = rigid_transform(pose, f"pose of sweep {self.sweep_name(index)} in {self.file}") @ self.ego_T_lidar
-        time = None if self.timestamps[-1] < _FIRST_MICROSECOND else timestamp  # None: the groups are numbered
         if pose is not None and not np.isfinite(pose).all():
             raise CFlowError(f"{self.file}: the pose of sweep {self.sweep_name(index)} is not finite")
-        times = self._point_times(index, time, points, is_missing)
         return Sweep(in_single(points), is_ground, pose, time, times)
-
-    def _point_times(
-        self, index: int, time: int | None, points: np.ndarray, is_missing: np.ndarray
-    ) -> np.ndarray | None:
-        """Read the (N,) seconds from the sweep to its points; those of another unit or clock are converted."""
-        times = self._values(index, "lidar_dt", self._rows(index))
-        if times is None or np.abs(times).max(initial=0) <= _LONGEST_LAG:
-            return times if times is None else times.astype(np.float32)
-        period = None if time is None else float(np.median(np.diff(self.timestamps))) * 1e-9
-        found = find_times({"time": times}, time, period, self._note, is_missing)
-        if found is None or found.seconds is None:
-            return None
-        points[found.is_stray] = np.nan
-        return np.where(found.is_stray, 0, found.seconds)
 
     def _labels(self, index: int) -> FlowLabels | None:
         rows = self._rows(index)
