@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import io
 import re
-from decimal import Decimal
 from typing import Any, Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.data.arrays.cloud_text import with_plain_nan
+from cflow_torch.data.arrays.cloud_text import numbers_of, with_plain_nan
 from cflow_torch.data.column_names import AXES, distinct_names
 from cflow_torch.errors import import_optional, warn
 
@@ -71,7 +70,7 @@ def _text_fields(body: bytes, header: Mapping[str, Sequence[str]]) -> dict[str, 
             continue
         kind = np.dtype(f"{header['TYPE'][k].lower()}{header['SIZE'][k]}")
         try:
-            numbers = None if k >= num_certain else _numbers([words[ends[k] - 1] for words in rows], kind)
+            numbers = None if k >= num_certain else numbers_of([words[ends[k] - 1] for words in rows], kind)
         except OverflowError:
             if k in needed:
                 raise
@@ -88,29 +87,6 @@ def _text_fields(body: bytes, header: Mapping[str, Sequence[str]]) -> dict[str, 
     if characters:
         warn(f"the fields {', '.join(characters)} of .pcd files hold characters, or follow them, so we leave them out")
     return fields
-
-
-def _numbers(words: Sequence[bytes], kind: np.dtype[Any]) -> np.ndarray:
-    """Return the numbers in words. A word that is not a number is a ValueError.
-
-    A number that the type does not have is an OverflowError that names it.
-    """
-    texts = np.array(words, np.bytes_)
-    if kind.kind == "f":
-        return texts.astype(kind)
-    limits = np.iinfo(kind)
-    try:
-        numbers = texts.astype(np.int64)
-        is_whole = (numbers >= limits.min) & (numbers <= limits.max)
-    except (ValueError, OverflowError):  # 7.000000, or more than 63 bits
-        try:
-            numbers = np.array([Decimal(word.decode()) for word in words], object)
-        except ArithmeticError as error:
-            raise ValueError(f"a word of it is not a number of {kind.name}") from error
-        is_whole = np.array([n.is_finite() and limits.min <= n <= limits.max and n == int(n) for n in numbers])
-    if not is_whole.all():
-        raise OverflowError(f"it has {words[int(is_whole.argmin())].decode()}, which is not a number of {kind.name}")
-    return numbers.astype(kind)
 
 
 def pcd_viewpoint(content: bytes) -> np.ndarray | None:
