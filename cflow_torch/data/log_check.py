@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
+from operator import methodcaller
 from typing import Any, Callable, Iterable, Iterator, List
 
 import numpy as np
@@ -114,6 +115,7 @@ class _CheckedLog(CachedLog):
 
 
 _Check = Callable[[_CheckedLog], List[Finding]]
+_FOUND: _Check = methodcaller("findings")
 
 
 def check_log(log: Log) -> None:
@@ -129,7 +131,7 @@ def find_problems(log: Log) -> list[str]:
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """
-    findings = _collect(_CheckedLog(log, _CACHED), (_found, _empty, _frame, _mask, _repeated, _lapses))
+    findings = _collect(_CheckedLog(log, _CACHED), (_FOUND, _empty, _frame, _mask, _repeated, _lapses))
     return [finding.text for finding in findings if finding.status != RIGHT and finding.is_quick]
 
 
@@ -140,7 +142,7 @@ def examine(log: Log) -> list[Finding]:
     """
     checks = (
         _sensor,
-        _found,
+        _FOUND,
         _empty,
         _frame,
         _times,
@@ -169,10 +171,6 @@ def _collect(log: _CheckedLog, checks: Iterable[_Check], tells_errors: bool = Fa
             findings = [Finding("log", WRONG, str(error))] if tells_errors else []
         found += [finding for finding in findings if finding not in found]
     return sorted(found, key=lambda finding: _TOPICS.index(finding.topic))
-
-
-def _found(log: Log) -> list[Finding]:
-    return log.findings()
 
 
 def _empty(log: _CheckedLog) -> list[Finding]:
@@ -395,28 +393,19 @@ def _each_sweep(log: _CheckedLog) -> list[Finding]:
     """Read every sweep: find those that cannot be read, have few points, repeat the one before, or are misplaced."""
     log.sweep(0)  # its error is that of the log
     neighbours = Neighbours.of(log, range(len(log)))
-    misplaced = _collect(log, [partial(_misplaced, neighbours=neighbours)])  # may need a sweep that cannot be read
-    return [*_unreadable(neighbours), *_small(neighbours), *misplaced]
-
-
-def _unreadable(neighbours: Neighbours) -> list[Finding]:
-    errors = neighbours.errors
-    if not errors:
-        return []
-    first = min(errors)
-    count = f"{len(errors)} of {len(errors) + len(neighbours.num_points)} sweeps cannot be read"
-    text = f"{count}, the first is sweep {first}: {errors[first]}. Their pairs have no flow"
-    return [Finding("sweeps", WRONG, text)]
-
-
-def _small(neighbours: Neighbours) -> list[Finding]:
-    small = neighbours.small
-    if not small:
-        return []
-    index = min(small)
-    text = f"{len(small)} of them have few points, the first is sweep {index} with {neighbours.num_points[index]:,}"
-    fix = "are their files complete? Else leave these sweeps out"
-    return [Finding("sweeps", WRONG, f"{text}, while those around it have {small[index]:,}: {fix}")]
+    errors, small = neighbours.errors, neighbours.small
+    findings = []
+    if errors:
+        first = min(errors)
+        text = f"{len(errors)} of {len(log)} sweeps cannot be read, the first is sweep {first}: {errors[first]}"
+        findings.append(Finding("sweeps", WRONG, f"{text}. Their pairs have no flow"))
+    if small:
+        first = min(small)
+        text = f"{len(small)} of them have few points, the first is sweep {first} with {neighbours.num_points[first]:,}"
+        fix = "are their files complete? Else leave these sweeps out"
+        findings.append(Finding("sweeps", WRONG, f"{text}, while those around it have {small[first]:,}: {fix}"))
+    # This may need a sweep that cannot be read.
+    return [*findings, *_collect(log, [partial(_misplaced, neighbours=neighbours)])]
 
 
 def _misplaced(log: _CheckedLog, neighbours: Neighbours) -> list[Finding]:

@@ -6,6 +6,7 @@ import os
 import re
 from contextlib import closing, suppress
 from importlib.metadata import version
+from operator import methodcaller
 from pathlib import Path
 from typing import Any, Sequence
 
@@ -168,7 +169,7 @@ class BagLog(Log):
             return Trajectory(matrices, times, False, f"{source} of {self.path}")
         if poses is None:
             return None
-        fits: Any = lambda trajectory: trajectory.covers(self.timestamps)
+        fits = methodcaller("covers", self.timestamps)
         near = find_poses_near(self.path.parent, self.log_id, self.timestamps, fits, self._note)
         if near is None:
             self._note(self._other_bag_with_poses())

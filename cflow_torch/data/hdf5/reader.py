@@ -6,7 +6,7 @@ import re
 import weakref
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Sequence
+from typing import Any
 
 import numpy as np
 
