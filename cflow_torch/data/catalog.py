@@ -16,7 +16,7 @@ from typing import Any, Iterator, Mapping, NamedTuple, Sequence, overload
 from cflow_torch.data.deskewing import DeskewedLog, check_deskew
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.finding import FOUND, Finding
-from cflow_torch.data.folders import distinct_names, find_folders, levels
+from cflow_torch.data.folders import find_folders, levels
 from cflow_torch.data.log import CachedLog, Log, LogWrapper, add_gaps_in_time, typical_sweeps
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
@@ -174,11 +174,16 @@ def find_all_sources(name: str, paths: Sequence[Any]) -> list[Any]:
 
 
 def _with_distinct_names(sources: Sequence[Any]) -> list[Any]:
-    """Rename logs of equal names, as results of both would be in one folder."""
+    """Put names of parent folders in front of equal names of logs, as results of both would be in one folder."""
     places = [getattr(source, "folder", source) for source in sources]
     names = [place.name if place.is_dir() else place.stem for place in places]
     above = [[part for part in place.absolute().parts[-2:0:-1] if part not in _OF_LAYOUTS] for place in places]
-    distinct = distinct_names(names, above)
+    distinct = list(names)
+    for depth in range(1, 1 + max(map(len, above), default=0)):
+        counts = Counter(distinct)
+        for k, parents in enumerate(above):
+            if counts[distinct[k]] > 1:
+                distinct[k] = "-".join([*parents[:depth][::-1], names[k]])
     renamed = zip(sources, names, distinct)
     return [source if name == other else RenamedSource(source, other) for source, name, other in renamed]
 
@@ -215,15 +220,11 @@ def _why_nothing_fits(top: Path) -> str:
     known = [kind for kind, _ in suffixes.most_common() if kind in (*_CONVERSIONS, *SUFFIXES)]
     suffix = min(known, key=lambda kind: kind in TEXTS, default="")
     count = suffixes[suffix]
-    clouds = [kind for kind in suffixes if kind in SUFFIXES] or [kind for kind in suffixes if kind in TEXTS]
-    clouds = [] if suffix in _CONVERSIONS and suffix not in TEXTS else clouds
-    if clouds and all(suffixes[kind] == 1 for kind in clouds):
-        return f"it has one file of points ({clouds[0]}); scene flow needs a file for each of two sweeps or more"
-    if clouds and clouds[0] in SUFFIXES:
-        return f"its {suffixes[clouds[0]]} {clouds[0]} files lie alone in their folders: put those of a log into one"
-    if suffix in _CONVERSIONS:
-        return f"its {count} {suffix} files are not read: {_CONVERSIONS[suffix]}"
-    return ""
+    if count == 1 and suffix in (*SUFFIXES, *TEXTS):
+        return f"it has one file of points ({suffix}); scene flow needs a file for each of two sweeps or more"
+    if suffix in SUFFIXES:
+        return f"its {count} {suffix} files lie alone in their folders: put those of a log into one"
+    return f"its {count} {suffix} files are not read: {_CONVERSIONS[suffix]}" if suffix else ""
 
 
 def _has_logs(name: str, root: Any) -> bool:
