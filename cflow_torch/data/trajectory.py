@@ -28,10 +28,6 @@ class Trajectory(NamedTuple):
     source: str
     labels: Sequence[str] = ()  # names of the rows, such as those of the clouds; () = unknown
 
-    def seen_from(self, frame_T_other: np.ndarray) -> Trajectory:
-        """Return the poses of another frame that is fixed in this one."""
-        return self._replace(poses=self.poses @ frame_T_other)
-
     def is_sparse(self, times_ns: Sequence[int]) -> bool:
         """Test whether poses are clearly rarer than sweeps at these times."""
         known: np.ndarray = np.zeros(0) if self.times_ns is None else self.times_ns

@@ -108,7 +108,9 @@ class ArraysLog(Log):
         self.files = find_clouds(self.folder, suffix)
         self.bin_layout = self._find_bin_layout(bin_columns)
         self._bin_columns: Any = self.bin_layout if bin_columns == "auto" else bin_columns
-        self._name_other_folders()
+        others = other_folders(self.folder)
+        if others:
+            self._note(f"we read the clouds in {self.files[0].parent.name}; there are others in {', '.join(others)}")
         self._ground = resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         mounting = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         stamps, table = self._known_times(times)
@@ -127,7 +129,8 @@ class ArraysLog(Log):
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
         self.poses = None
         if trajectory is not None:
-            self._take_poses(_of_ego(trajectory, whose, mounting))
+            frame_T_ego = {"lidar": np.linalg.inv(mounting), "sensor": mounting}.get(whose, np.eye(4))
+            self._take_poses(trajectory._replace(poses=trajectory.poses @ frame_T_ego))
         self.gaps |= frozenset(self._gaps_in_numbers())
         self._note(f"its poses come from {_VIEWPOINT}" if self.has_viewpoints else "")
         if whose == "auto" and ego_T_lidar is not None and self.poses is not None:
@@ -167,11 +170,6 @@ class ArraysLog(Log):
         """Read the columns of cloud `index` besides x, y, z, see `cloud_file.read_columns`."""
         self._timestamp(index)
         return read_columns(self.files[index], self._bin_columns)
-
-    def _name_other_folders(self) -> None:
-        others = other_folders(self.folder)
-        if others:
-            self._note(f"we read the clouds in {self.files[0].parent.name}; there are others in {', '.join(others)}")
 
     def _find_bin_layout(self, columns: Any) -> BinLayout | None:
         """Return the layout of `.bin` files; None = the files have another suffix. We say if it is not KITTI's."""
@@ -350,13 +348,6 @@ class ArraysLog(Log):
         missing = f"sweeps are missing by the numbers of its files, first after {first}"
         self._note(f"{missing}; no history or future of a window reaches over them")
         return gaps  # type: ignore[no-any-return]
-
-
-def _of_ego(trajectory: Trajectory, whose: str, mounting: np.ndarray) -> Trajectory:
-    """Return the poses of the ego frame, from those of the LiDAR or of a sensor to which `mounting` maps points."""
-    if whose == "lidar":
-        return trajectory.seen_from(np.linalg.inv(mounting))
-    return trajectory.seen_from(mounting) if whose == "sensor" else trajectory
 
 
 def _are_regular(numbers: Sequence[int]) -> bool:

@@ -80,7 +80,8 @@ def times_of_names(names: Sequence[str]) -> list[int] | None:
         return None
     names = _without_counters(names)
     if all(map(_DIGITS.search, names)):
-        names = [_DIGITS.sub(_with_separators, name) for name in names]
+        date = r"\1-\2-\3T\4:\5:\6"
+        names = [_DIGITS.sub(lambda found: found.expand(date + (r".\7" if found[7] else "")), name) for name in names]
     stamps = [_STAMP.search(name) for name in names]
     seconds = [[pattern.search(name) for name in names] for pattern in _SECONDS]
     if all(stamps):
@@ -91,11 +92,6 @@ def times_of_names(names: Sequence[str]) -> list[int] | None:
     times = times or nanoseconds_of_dates(names)
     are_times = times is not None and max(times) < _LIMIT and len(set(times)) == len(times)
     return times if are_times else None
-
-
-def _with_separators(date: re.Match[str]) -> str:
-    *numbers, fraction = date.groups()
-    return "{}-{}-{}T{}:{}:{}".format(*numbers) + (f".{fraction}" if fraction else "")
 
 
 def _without_counters(names: Sequence[str]) -> Sequence[str]:
