@@ -42,12 +42,10 @@ def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
         return log
     if reading not in READ_AS:
         raise CFlowError(f"read_as={reading!r}: give one of {', '.join(str(one or 'null') for one in READ_AS)}")
+    placed = _in_world_of_points(log) if reading in ("auto", WORLD) else log
     if reading == "auto":
-        placed = _in_world_of_points(log)
         return ReadAs(placed, WORLD, is_found=True) if _is_in_world(placed) else log
-    if reading == WORLD:
-        log = _in_world_of_points(log)
-    return log if reading is None else ReadAs(log, reading)
+    return log if reading is None else ReadAs(placed, reading)
 
 
 def _in_world_of_points(log: Log) -> Log:

@@ -131,8 +131,12 @@ def _small_unit(positions: np.ndarray) -> tuple[str, str]:
 
 def _height_of_ground(positions: np.ndarray) -> float:
     """Return the median height of the ground near the sensor, 0 if there is none."""
-    heights = positions[find_ground(positions, "grid") & (np.hypot(*positions[:, :2].T) < _NEAR), 2]
-    return float(np.median(heights)) if len(heights) else 0.0
+    ground = _near_ground(positions)
+    return float(np.median(ground[:, 2])) if len(ground) else 0.0
+
+
+def _near_ground(positions: np.ndarray) -> np.ndarray:
+    return positions[find_ground(positions, "grid") & (np.hypot(*positions[:, :2].T) < _NEAR)]  # type: ignore[no-any-return]
 
 
 def _is_spherical(positions: np.ndarray) -> bool:
@@ -159,19 +163,13 @@ def _tilt_of(positions: np.ndarray) -> np.ndarray | None:
         turned = positions @ rotations_about(axis, np.radians(turn)).T
         if turn and not has_ground(turned):
             continue
-        slopes = _slopes_of_ground(turned)
-        if slopes is not None:
-            return np.array(((axis == 0) * turn - slopes[1], (axis == 1) * turn + slopes[0]))
+        ground = _near_ground(turned)
+        if len(ground) < _FEWEST:
+            continue
+        plane, *_ = np.linalg.lstsq(np.column_stack([ground[:, :2], np.ones(len(ground))]), ground[:, 2], rcond=None)
+        along_x, along_y = np.degrees(np.arctan(plane[:2]))
+        return np.array(((axis == 0) * turn - along_y, (axis == 1) * turn + along_x))
     return None
-
-
-def _slopes_of_ground(positions: np.ndarray) -> np.ndarray | None:
-    """Return the slopes of the plane of the ground near the sensor along x and y, degrees; None = too little of it."""
-    ground = positions[find_ground(positions, "grid") & (np.hypot(*positions[:, :2].T) < _NEAR)]
-    if len(ground) < _FEWEST:
-        return None
-    plane, *_ = np.linalg.lstsq(np.column_stack([ground[:, :2], np.ones(len(ground))]), ground[:, 2], rcond=None)
-    return np.degrees(np.arctan(plane[:2]))  # type: ignore[no-any-return]
 
 
 _UP = "give points with z up"

@@ -123,7 +123,7 @@ class KITTILog(ArraysLog):
     def moving(self, index: int) -> np.ndarray | None:
         """Read which points of sweep `index` belong to a class of moving points, (N,) bool; None without labels."""
         classes = self.columns(index).get("class")
-        return None if classes is None else stored_labels.are_moving(classes)
+        return None if classes is None else np.isin(classes, stored_labels.MOVING)
 
     def _labels(self, index: int) -> FlowLabels | None:
         boxes = self._boxes
@@ -137,9 +137,9 @@ class KITTILog(ArraysLog):
         if found is not None:
             classes, _ = found
             flow = (transform_points(points, T_ego1_ego0) - points).astype(np.float32)
-            is_valid = ~stored_labels.are_moving(classes) & ~np.isin(classes, stored_labels.UNLABELLED)
-            return FlowLabels(flow, stored_labels.class_categories()[classes], is_valid)
-        pair = [boxes.get(self._frames[k], stored_labels.no_boxes()) for k in (index, index + 1)]
+            is_valid = ~np.isin(classes, (*stored_labels.MOVING, *stored_labels.UNLABELLED))
+            return FlowLabels(flow, stored_labels.CATEGORY_OF_CLASS[classes], is_valid)
+        pair = [boxes.get(self._frames[k], stored_labels.NO_BOXES) for k in (index, index + 1)]
         labels = flow_from_boxes(points, pair[0].boxes, pair[1].boxes, T_ego1_ego0)
         return FlowLabels(labels.flow, labels.category, labels.is_valid & self._is_annotated(points, pair[0]))
 
