@@ -72,7 +72,12 @@ def read_table(path: PathLike, bin_columns: int | BinLayout | None = None) -> tu
         points = np.stack(_positions(fields), axis=1)
         check_array(points, "its cloud", (None, 3), "fiu", "(N,) numbers each for x, y and z, metres")
     precision = np.float64 if np.result_type(points, np.float32) == np.float64 else np.float32
-    return points.astype(precision, copy=False), _other_columns(fields)
+    others = {}
+    for name, values in fields.items():
+        kind = values.dtype
+        if name.lower() not in AXES and values.shape == (len(points),) and kind.kind in "biuf" and kind.itemsize <= 8:
+            others[name] = values.astype(kind.newbyteorder("="), copy=False)
+    return points.astype(precision, copy=False), others
 
 
 def read_columns(path: PathLike, bin_columns: int | BinLayout | None = None) -> dict[str, np.ndarray]:
@@ -82,16 +87,6 @@ def read_columns(path: PathLike, bin_columns: int | BinLayout | None = None) -> 
     and columns of several numbers per point.
     """
     return read_table(path, bin_columns)[1]
-
-
-def _other_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    shape = _positions(fields)[0].shape
-    kept = {}
-    for name, values in fields.items():
-        kind = values.dtype
-        if name.lower() not in AXES and values.shape == shape and kind.kind in "biuf" and kind.itemsize <= 8:
-            kept[name] = values.astype(kind.newbyteorder("="), copy=False)
-    return kept
 
 
 def in_single(points: np.ndarray) -> np.ndarray:

@@ -128,7 +128,9 @@ def tables_of_values(content: bytes, path: Path) -> Iterator[Table]:
         names = max(rows, key=len, default={}).keys()
         if not names or 2 * sum(row.keys() == names for row in rows) <= len(rows):
             continue
-        texts = labels or [_text_of(member) for member in members]
+        # Without a name, the first text in a row is its name.
+        fields = [list(member.values()) if isinstance(member, dict) else [] for member in members]
+        texts = labels or [next((each for each in row if isinstance(each, str)), "") for row in fields]
         words = np.array([[row.get(name, "nan") for name in names] for row in rows], str)
         yield Table(list(names), words, texts if len({*texts, ""}) > len(texts) else [])
 
@@ -198,11 +200,6 @@ def _numbers_of(value: Any, name: str) -> Iterator[tuple[str, str]]:
     elif isinstance(value, dict):
         for key, member in value.items():
             yield from _numbers_of(member, f"{name}.{key}" if name else key)
-
-
-def _text_of(value: Any) -> str:
-    texts = [each for each in value.values() if isinstance(each, str)] if isinstance(value, dict) else []
-    return texts[0] if texts else ""
 
 
 def split_line(line: str) -> list[str]:

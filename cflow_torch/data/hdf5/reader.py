@@ -199,24 +199,19 @@ class HDF5Log(Log):
     def _stored_pose(self, index: int, dtype: Any = np.float64) -> Any:
         """Read a pose, or compute it from the pose before and the ego motion; None = it is unknown."""
         pose = self._matrix(index, "pose", dtype)
-        while pose is None and len(self._chain) <= index:
-            self._chain.append(self._next_in_chain())
-        return self._chain[index] if pose is None else pose
-
-    def _next_in_chain(self) -> np.ndarray | None:
-        """Return the pose of the sweep after those of the chain; without poses, the world is the first ego frame."""
-        index = len(self._chain)
-        stored = self._matrix(index, "pose", np.float64)
-        if stored is not None:
-            return stored
-        if index == 0:
-            has_motions = self._matrix(0, "ego_motion", np.float64) is not None
-            return np.eye(4) if has_motions and self._matrix(1, "pose", np.float64) is None else None
-        motion = self._matrix(index - 1, "ego_motion", np.float64)
-        if motion is None or self._chain[-1] is None:
-            return None
-        motion = rigid_transform(motion, f"ego_motion of sweep {self.sweep_name(index - 1)} in {self.file}")
-        return self._chain[-1] @ np.linalg.inv(motion)  # type: ignore[no-any-return]
+        if pose is not None:
+            return pose
+        for k in range(len(self._chain), index + 1):
+            pose = self._matrix(k, "pose", np.float64)
+            motion = None if pose is not None else self._matrix(max(k - 1, 0), "ego_motion", np.float64)
+            if pose is None and k == 0:  # without poses, the world is the first ego frame
+                has_motions = motion is not None and self._matrix(1, "pose", np.float64) is None
+                pose = np.eye(4) if has_motions else None
+            elif pose is None and motion is not None and self._chain[-1] is not None:
+                motion = rigid_transform(motion, f"ego_motion of sweep {self.sweep_name(k - 1)} in {self.file}")
+                pose = self._chain[-1] @ np.linalg.inv(motion)
+            self._chain.append(pose)
+        return self._chain[index]
 
     def _stated_extrinsics(self) -> np.ndarray:
         """Return the extrinsics of the scene's attribute, otherwise the recognised ones."""
