@@ -320,8 +320,10 @@ def _repeated(log: _CheckedLog) -> list[Finding]:
     if repeats(*first):
         text = "sweep 1 repeats the points of sweep 0: leave one out, or copy its file again"
         return [Finding("sweeps", WRONG, text, True)]
-    is_known = _is_grid(first[0]) or bool(log.frame[0])  # then "to the millimetre" means nothing
-    again = 0.0 if is_known else _share_again(*first)
+    # On a grid, most points have an x that others have, too. Then "to the millimetre" means nothing.
+    x = as_numpy(first[0].points)[:: len(first[0].points) // _MOST_SEEN + 1, 0]
+    is_grid = len(np.unique(x)) < _GRID * len(x)
+    again = 0.0 if is_grid or log.frame[0] else _share_again(*first)
     if again > _ACCUMULATED:
         text = f"{100 * again:.0f} % of the points of the first sweep are also in the second one, to the millimetre"
         fix = "give the points that each sweep has measured itself, not a map or sweeps that were added up"
@@ -358,13 +360,6 @@ def _share_again(pc0: Sweep, pc1: Sweep) -> float:
     around = ((points1 > moved.min(0) - _SAME) & (points1 < moved.max(0) + _SAME)).all(axis=1)
     scale = IN_PLACE / _SAME
     return Structure(scale * points1[around]).share(scale * moved, np.eye(4))
-
-
-def _is_grid(sweep: Sweep) -> bool:
-    """Test whether a sweep was thinned to a grid: most points have an x that others have, too."""
-    points = as_numpy(sweep.points)
-    x = points[:: len(points) // _MOST_SEEN + 1, 0]
-    return len(np.unique(x)) < _GRID * len(x)
 
 
 def _shared_directions(pc0: Sweep, pc1: Sweep) -> float:

@@ -96,14 +96,8 @@ def _transposed(axes: np.ndarray) -> _Convert:
     return lambda poses: as_matrix(axes @ poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3])
 
 
-def _still(poses: np.ndarray) -> np.ndarray:
-    return np.tile(np.eye(4), (len(poses), 1, 1))
-
-
 def _unturned(poses: np.ndarray) -> np.ndarray:
-    unturned = _still(poses)
-    unturned[:, :3, 3] = poses[:, :3, 3]
-    return unturned
+    return as_matrix(np.tile(np.eye(3), (len(poses), 1, 1)), poses[:, :3, 3])
 
 
 def _joined(poses: np.ndarray) -> np.ndarray:
@@ -196,7 +190,7 @@ READINGS: dict[str, Reading] = {
     "world_axes": Reading("the points have the axes of the world, but lie around the vehicle", _unturned),
     STILL: Reading(
         "the static world stands still without the poses, so they are of another log, or the points are compensated",
-        _still,
+        lambda poses: np.tile(np.eye(4), (len(poses), 1, 1)),
         margin=_OF_STILL,
     ),
     **TIMES_OF_POSES,

@@ -131,7 +131,11 @@ class WaymoLog(BoxLog):
         time = self.timestamps[index] // 1000
         keys = [(time, laser) for laser in self._lasers]
         images = [self._images.images(keys, f"{LIDAR}{number}", 4) for number in self._returns]
-        pixel_poses = self._read_pixel_poses(time)
+        pixel_poses = None
+        if TOP in self._lasers:
+            pixel_poses = self._pixel_poses.images([(time, TOP)], PIXEL_POSE, 6)[time, TOP]
+            if pixel_poses is None:
+                raise CFlowError(f"{self._pixel_poses.file} has no pixel poses of frame {time}; copy it again")
         points = [np.zeros((0, 3))]
         is_zone = [np.zeros(0, dtype=bool)]
         for key in keys:
@@ -144,15 +148,6 @@ class WaymoLog(BoxLog):
                 points.append(of_image)
                 is_zone.append(image.reshape(-1, image.shape[2])[pixels, NO_LABEL_ZONE] == 1)
         return np.concatenate(points).astype(np.float32), np.concatenate(is_zone)
-
-    def _read_pixel_poses(self, time: int) -> np.ndarray | None:
-        """Read the poses of the pixels of TOP, (H, W, 6); None if this laser is not read."""
-        if TOP not in self._lasers:
-            return None
-        poses = self._pixel_poses.images([(time, TOP)], PIXEL_POSE, 6)[time, TOP]
-        if poses is None:
-            raise CFlowError(f"{self._pixel_poses.file} has no pixel poses of frame {time}; copy it again")
-        return poses
 
     def _read_lasers(self) -> dict[int, LaserCalibration]:
         component = Component(self.file, "lidar_calibration")
