@@ -13,7 +13,7 @@ import numpy as np
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses, typical_sweeps
 from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, judge_log
-from cflow_torch.data.neighbours import Neighbours, middle_sweeps
+from cflow_torch.data.neighbours import Neighbours
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
 from cflow_torch.diagnosis.inspection import mask_problem, repeats
@@ -26,6 +26,7 @@ from cflow_torch.transforms import relative_transform, transform_points
 from cflow_torch.types import Array, Sweep, as_numpy
 
 _CACHED = 12  # sweeps that several checks read
+_ALTERNATING = 8  # sweeps in the middle of a log that tell whether two sensors alternate
 _STRIP = 4.0  # metres, half width of the strip whose points are looked for in the next sweep
 _SAMPLE = 1000  # points of the strip that are looked for
 _SAME = 0.001  # metres between two equal points
@@ -105,8 +106,10 @@ class _CheckedLog(CachedLog):
     @cached_property
     def misfit(self) -> list[Finding]:
         """Why neighbouring sweeps do not fit whatever the poses: they measure other directions, or alternate."""
-        parts = _parts(self)
-        return parts or ([_TWO_SENSORS] if Neighbours.of(self, middle_sweeps(self)).alternate else [])
+        count = min(_ALTERNATING, len(self))
+        first = (len(self) - count) // 2
+        middle = range(first, first + count)
+        return _parts(self) or ([_TWO_SENSORS] if Neighbours.of(self, middle).alternate else [])
 
     @cached_property
     def lapses(self) -> list[Lapse]:

@@ -145,7 +145,10 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
         if _does_not_fit(judgement, hardly_moves):
             others = _pairs_without_repeats(log, poses, jumps, {index for pair in pairs for index in pair})
             again = judge(make_pairs(others, scans, False))
-            judgement = again if _contradicts(again, judgement) else judgement
+            # Only a few sweeps are wrong if others fit clearly better as given, and not under the best reading.
+            is_worse = not judgement.best or again.shares.get(judgement.best[0], float("nan")) <= again.given
+            is_better = not again.best and again.given >= max(LEAST_SHARE, MARGIN * judgement.given)
+            judgement = again if is_better and is_worse else judgement
     if hardly_moves and not judgement.best and judgement.given < _UNCLEAR:
         spread = choose_pairs(len(log.timestamps), None)
         clouds = [[replace(log.sweep(index), pose=None) for index in pair] for pair in spread]
@@ -187,15 +190,6 @@ def _pairs_without_repeats(
         if not repeated:
             return pairs
         excluded |= repeated
-
-
-def _contradicts(again: Judgement, judgement: Judgement) -> bool:
-    """Test whether other sweeps fit clearly better as given, and show that the best reading, if any, is wrong.
-
-    Then only a few sweeps are wrong, such as one that repeats the one before. Errors of measurement differ by sweep.
-    """
-    is_worse = not judgement.best or again.shares.get(judgement.best[0], float("nan")) <= again.given
-    return not again.best and is_worse and again.given >= max(LEAST_SHARE, MARGIN * judgement.given)
 
 
 def _make_pairs(

@@ -84,16 +84,6 @@ def begins_late(log: Log) -> bool:
     return has_ground(np.column_stack([columns[:, 1:], fourth]).astype(np.float32))
 
 
-def _coarse_coordinates(log: Log) -> list[Finding]:
-    """Tell coordinates of a map that are too large for float32."""
-    points = as_numpy(log.sweep(typical_sweeps(log)[0]).points)[:, :3]
-    step = float(np.spacing(np.nanmax(np.abs(points), initial=0).astype(np.float32)))
-    if points.dtype != np.float32 or not step > _COARSEST:
-        return []
-    text = f"the points are float32 with steps of {step:.2g} m, as they are far from the origin of the world"
-    return [Finding("frame", WRONG, f"{text}: give points and poses relative to a place nearby", True)]
-
-
 class ReadAs(LogWrapper):
     """A log whose points and poses are converted, see `read_as`. `is_found` tells that we found the reading.
 
@@ -132,8 +122,15 @@ class ReadAs(LogWrapper):
         said = Finding("frame", RIGHT, f"as you say, {what} (read_as={self.reading})")
         used = f"we move them to that of the vehicle. data.read_as={self.reading} does the same without this line"
         found = Finding("frame", FOUND, f"{what}, so {used}", True)
-        coarse = [] if self.reading != WORLD else _coarse_coordinates(self.log)
-        return [*self.log.findings(), found if self.is_reading_found else said, *coarse]
+        findings = [*self.log.findings(), found if self.is_reading_found else said]
+        if self.reading == WORLD:  # are coordinates of a map too large for float32?
+            points = as_numpy(self.log.sweep(typical_sweeps(self.log)[0]).points)[:, :3]
+            step = float(np.spacing(np.nanmax(np.abs(points), initial=0).astype(np.float32)))
+            if points.dtype == np.float32 and step > _COARSEST:
+                text = f"the points are float32 with steps of {step:.2g} m"
+                why = "as they are far from the origin of the world: give points and poses relative to a place nearby"
+                findings.append(Finding("frame", WRONG, f"{text}, {why}", True))
+        return findings
 
     @cached_property
     def poses(self) -> np.ndarray | None:

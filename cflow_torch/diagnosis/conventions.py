@@ -64,11 +64,7 @@ class Reading(NamedTuple):
     fix: str = ""  # what corrects it; "" = the value of `read_as` with its name
 
 
-def scaled(unit: float) -> _Convert:
-    return partial(_scale, unit)  # logs that keep it must be picklable
-
-
-def _scale(unit: float, poses: np.ndarray) -> np.ndarray:
+def scale_poses(unit: float, poses: np.ndarray) -> np.ndarray:
     return as_matrix(poses[..., :3, :3], unit * poses[..., :3, 3])
 
 
@@ -223,7 +219,10 @@ READINGS: dict[str, Reading] = {
         "the quaternions of the poses begin with w, but were read with w last", _reordered((1, 2, 3, 0))
     ),
     "w_last": Reading("the quaternions of the poses end with w, but were read with w first", _reordered((3, 0, 1, 2))),
-    **{name: Reading(f"the poses are in {name}", scaled(unit), margin=_OF_STILL) for name, unit in UNITS.items()},
+    **{
+        name: Reading(f"the poses are in {name}", partial(scale_poses, unit), margin=_OF_STILL)
+        for name, unit in UNITS.items()
+    },
     **{
         f"points_{name}": Reading(f"the points are in {name}", of_points=_of_axes(unit * np.eye(3)))
         for name, unit in UNITS.items()

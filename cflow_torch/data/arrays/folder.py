@@ -87,7 +87,9 @@ def _places(folder: Path) -> list[tuple[Path, _Kinds]]:
         return passed_over
     is_log = any(path.name in (*POSE_FILES, "times.txt") for path in _tables(folder))
     if is_log or (len(below) == 1 and (own or find_pose_files(folder) or find_times_files(folder))):
-        return [*sorted(below.items(), key=lambda place: -_middle_of(place[1]).stat().st_size), *passed_over]
+        clouds = {path: sorted(next(iter(kinds.values()))) for path, kinds in below.items()}
+        size = {path: files[len(files) // 2].stat().st_size for path, files in clouds.items()}
+        return [*sorted(below.items(), key=lambda place: -size[place[0]]), *passed_over]
     return passed_over
 
 
@@ -95,11 +97,6 @@ def _larger(folder: Path, fewest: int) -> _Kinds:
     """Return the kinds of clouds in a folder that have more files, and are no results of ours."""
     kinds = {kind: files for kind, files in _kinds(folder).items() if len(files) > fewest}
     return {} if kinds and record_in(visible(folder)) else kinds
-
-
-def _middle_of(kinds: _Kinds) -> Path:
-    files = sorted(next(iter(kinds.values())))
-    return files[len(files) // 2]
 
 
 def other_folders(folder: Path) -> list[str]:
