@@ -14,7 +14,7 @@ from cflow_torch.data.arrays.tables import MATRIX, Table, parse_table, tables_of
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key, visible
-from cflow_torch.data.npy_file import parse_npy
+from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, read_bytes, suffix_of
 from cflow_torch.data.trajectory import Trajectory, checked_poses, positions_of_degrees
 from cflow_torch.transforms import ROUNDING, as_matrix, poses_from_quaternions, rotations_of
@@ -84,7 +84,7 @@ def files_of_poses(folder: Path) -> list[Path]:
 def parse_poses(content: bytes, path: Path) -> Trajectory:
     """Return the poses in the content of a file of text or `STRUCTURED`."""
     if suffix_of(path) == ".npy":
-        numbers = parse_npy(content, path, "pass a .npy file of (K, 4, 4) numbers")
+        numbers = read_npy(path, "pass a .npy file of (K, 4, 4) numbers", content)
         if numbers.shape in ((3, 4), (4, 4)):  # of a folder with a file per pose
             numbers = numbers[None]
         if numbers.ndim == 2 and numbers.shape[1] in _UNNAMED and numbers.dtype.kind in "fiu":
