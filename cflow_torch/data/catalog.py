@@ -100,6 +100,8 @@ def recognise(root: Any) -> str:
 
     Cost: next to folders of point clouds, the first log of each format that fits is opened.
     """
+    from cflow_torch.data.arrays.folder import is_array_log
+
     top = as_path(root)
     with remote_errors(top):
         if not top.exists():
@@ -113,7 +115,9 @@ def recognise(root: Any) -> str:
             if found:
                 break
     found = [name for name in found if _has_logs(name, root)]  # nuScenes and TruckScenes have the same file names
-    if found and _have_clouds(marked, top):  # folders of other data sets may be called so
+    # Each path with a mark, and the folders between it and the top, may be a folder of clouds that is called so.
+    around = dict.fromkeys(folder for path in marked for folder in (path, *path.parents))
+    if found and any(is_array_log(folder) for folder in around if folder == top or top in folder.parents):
         errors = {name: _error_of(name, root) for name in found}
         opened = [name for name in found if not errors[name]]
         if not opened and not _error_of("arrays", root):
@@ -134,14 +138,6 @@ def _paths_below(top: Path) -> Iterator[list[Path]]:
     yield [top]
     for level in levels(top, _DEEPEST):
         yield [path for _, inside in level for path in inside]
-
-
-def _have_clouds(marked: Sequence[Path], top: Path) -> bool:
-    """Test whether one of the marked paths, or a folder between it and the top, is a folder of point clouds."""
-    from cflow_torch.data.arrays.folder import is_array_log
-
-    around = dict.fromkeys(folder for path in marked for folder in (path, *path.parents))  # each only once
-    return any(is_array_log(folder) for folder in around if folder == top or top in folder.parents)
 
 
 def matching_paths(path: Any) -> list[Any]:

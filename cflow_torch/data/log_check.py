@@ -134,7 +134,7 @@ def find_problems(log: Log) -> list[str]:
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """
-    findings = _collect(_CheckedLog(log, _CACHED), (_FOUND, _empty, _frame, _mask, _repeated, _lapses))
+    findings = _collect(_CheckedLog(log, _CACHED), (_FOUND, _frame, _mask, _repeated, _lapses))
     return [finding.text for finding in findings if finding.status != RIGHT and finding.is_quick]
 
 
@@ -146,7 +146,6 @@ def examine(log: Log) -> list[Finding]:
     checks = (
         _sensor,
         _FOUND,
-        _empty,
         _frame,
         _times,
         _poses,
@@ -176,20 +175,14 @@ def _collect(log: _CheckedLog, checks: Iterable[_Check], tells_errors: bool = Fa
     return sorted(found, key=lambda finding: _TOPICS.index(finding.topic))
 
 
-def _empty(log: _CheckedLog) -> list[Finding]:
-    if not log.is_empty:
-        return []
-    names = ", ".join(map(_name_of, log.typical))
-    return [Finding("sweeps", WRONG, f"no point is finite in {names}: are the files complete?", True)]
-
-
 def _frame(log: _CheckedLog) -> list[Finding]:
     """Check a typical sweep; without poses also the last one, which is far away if points are in the world's frame.
 
     Then check the ego motion in the frame that the points will have.
     """
     if log.is_empty:
-        return []
+        names = ", ".join(map(_name_of, log.typical))
+        return [Finding("sweeps", WRONG, f"no point is finite in {names}: are the files complete?", True)]
     reading, problem = log.frame
     checked = log.typical[0]
     is_last = not problem and known_poses(log) is None

@@ -139,10 +139,14 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     if poses is not None:  # points 20 m away move by less than 0.1 m in most sweep intervals
         speed = difference(_motions(poses, slice(-1), slice(1, None)), np.eye(4))
         hardly_moves = bool(np.median(speed) < _LEAST_TIMED)
-    if poses is not None and _does_not_fit(judgement, hardly_moves):  # are only a few sweeps wrong?
+
+    def does_not_fit() -> bool:
+        return bool(judgement.best) or (judgement.is_low and not hardly_moves)
+
+    if poses is not None and does_not_fit():  # are only a few sweeps wrong?
         pairs = _pairs_without_repeats(log, poses, jumps, ()) or chosen  # all may repeat the one before
         judgement = judgement if pairs == chosen else judge(make_pairs(pairs, scans, False))
-        if _does_not_fit(judgement, hardly_moves):
+        if does_not_fit():
             others = _pairs_without_repeats(log, poses, jumps, {index for pair in pairs for index in pair})
             again = judge(make_pairs(others, scans, False))
             # Only a few sweeps are wrong if others fit clearly better as given, and not under the best reading.
@@ -157,11 +161,6 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     if STILL in judgement.best and log.unwrapped.has_viewpoints:
         return replace(judgement, shares={**judgement.shares, WORLD: judgement.shares[STILL]}, best=(WORLD,))
     return judgement
-
-
-def _does_not_fit(judgement: Judgement, hardly_moves: bool) -> bool:
-    """Test whether another reading is better or, if the poses move, little of the structure is in place."""
-    return bool(judgement.best) or (judgement.is_low and not hardly_moves)
 
 
 def fits_better(log: Log, others: np.ndarray) -> bool:

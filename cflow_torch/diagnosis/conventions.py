@@ -68,20 +68,15 @@ def scale_poses(unit: float, poses: np.ndarray) -> np.ndarray:
     return as_matrix(poses[..., :3, :3], unit * poses[..., :3, 3])
 
 
-def turned(axes: np.ndarray) -> _Convert:
-    """Return what gives poses of a frame with other axes the axes of the points."""
-    T_stored_ego = as_matrix(axes.T)
+def turned(axes: np.ndarray, place: Sequence[float] = (0, 0, 0)) -> _Convert:
+    """Return what gives poses of a frame with other axes, or of another place, those of the points."""
+    T_stored_ego = as_matrix(axes.T, place)
     return lambda poses: poses @ T_stored_ego
 
 
 def _mirrored(axes: np.ndarray) -> _Convert:
     mirror = as_matrix(axes)
     return lambda poses: mirror @ poses @ mirror
-
-
-def _mounted(x: float, y: float) -> _Convert:
-    ego_T_points = as_matrix(np.eye(3), (x, y, 0))
-    return lambda poses: poses @ ego_T_points
 
 
 def _reordered(order: Sequence[int]) -> _Convert:
@@ -169,7 +164,7 @@ def _mounts() -> dict[str, Reading]:
     for size in (0.7, 1.4, 2.7, 4.0):
         for x, y in ((size, 0), (-size, 0), (0, size), (0, -size)):
             name, opposite = (f"{MOUNT} {sign * x:g} {sign * y:g}" for sign in (1, -1))
-            readings[name] = Reading("", _mounted(x, y), margin=_SMALL, opposite=opposite)
+            readings[name] = Reading("", turned(np.eye(3), (x, y, 0)), margin=_SMALL, opposite=opposite)
     return readings
 
 

@@ -20,6 +20,7 @@ from cflow_torch.data.folders import natural_key
 from cflow_torch.data.paths import read_bytes, suffix_of
 
 _FEWEST_NUMBERS = 7  # of a pose
+_LETTERS = re.compile("[A-Za-z]")
 COMMENTS = ("#", "%", "//")
 """Beginnings of lines that are no rows."""
 MATRIX = tuple(f"m{k}" for k in range(16))
@@ -46,7 +47,7 @@ def parse_table(content: bytes, path: Path) -> Table:
         lines = _poses_only([line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()])
         start, names = start_of_rows(lines, _FEWEST_NUMBERS)
         rows = [split_line(line) for line in lines[start:] if not line.startswith(COMMENTS)]
-        texts = [line for line in lines[:start] if _has_letters(line) and not line.startswith(COMMENTS)]
+        texts = [line for line in lines[:start] if _LETTERS.search(line) and not line.startswith(COMMENTS)]
         width = min(map(len, rows), default=0)
         is_uneven = any(any(row[width:]) for row in rows)  # a line may lack the comma at the end of others
         if not rows or is_uneven or (len(texts) > 1 and not names):
@@ -71,26 +72,22 @@ def start_of_rows(lines: Sequence[str], fewest: int) -> tuple[int, list[str]]:
     """
     plain = [line for line in lines if line and not line.startswith(COMMENTS)]
     width = len(split_line(plain[len(plain) // 2])) if plain else 0
-    start = next((k for k, line in enumerate(lines) if _is_row(line, width, fewest)), len(lines))
+    start = len(lines)
+    for k, line in enumerate(lines):
+        words = split_line(line)
+        count = sum(is_number(_seconds_of_dates([word])[0]) for word in words)
+        is_row = count + words.count("") == width or count >= fewest
+        if is_row and len(words) == width and not line.startswith(COMMENTS):
+            start = k
+            break
     ends_empty = start < len(lines) and split_line(lines[start])[-1] == ""
     found = []
-    for line in filter(_has_letters, reversed(lines[:start])):
+    for line in filter(_LETTERS.search, reversed(lines[:start])):
         header = line.lstrip("#%/ ")
         names = re.split("[,;]" if re.search("[,;]", header) else r"\s+", header)
         names += [""] * (ends_empty and len(names) == width - 1)  # each row ends with a comma
         found += [[name.strip(' "') for name in names]] * (len(names) == width)
     return start, min(found, key=lambda names: len(set(names)) < width, default=[])
-
-
-def _is_row(line: str, width: int, fewest: int) -> bool:
-    words = split_line(line)
-    count = sum(is_number(_seconds_of_dates([word])[0]) for word in words)
-    is_row = count + words.count("") == width or count >= fewest
-    return is_row and len(words) == width and not line.startswith(COMMENTS)
-
-
-def _has_letters(line: str) -> bool:
-    return re.search("[A-Za-z]", line) is not None
 
 
 def _seconds_of_dates(column: Sequence[str]) -> Sequence[str]:

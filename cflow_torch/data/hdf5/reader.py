@@ -37,11 +37,11 @@ def find_hdf5_scenes(root: PathLike) -> list[Path]:
 
     A missing path is a `CFlowError`.
     """
-    return sorted(search(as_path(root), _scenes_in, 1, "a scene (.h5), or a folder of scenes"))
 
+    def scenes_in(folder: Path) -> list[Path]:
+        return [folder] if folder.is_file() else [path for path in visible(folder) if path.suffix == ".h5"]
 
-def _scenes_in(folder: Path) -> list[Path]:
-    return [folder] if folder.is_file() else [path for path in visible(folder) if path.suffix == ".h5"]
+    return sorted(search(as_path(root), scenes_in, 1, "a scene (.h5), or a folder of scenes"))
 
 
 class HDF5Log(Log):
