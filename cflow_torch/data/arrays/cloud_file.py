@@ -33,6 +33,11 @@ TABLES: dict[str, Any] = {  # suffix -> function that reads, and one that writes
     ".feather": (feather.read_table, feather.write_feather),
     ".parquet": (parquet.read_table, parquet.write_table),
 }
+_WIDER: dict[str, dict[Any, Any]] = {  # suffix -> types that the format lacks, and those that we write
+    ".pcd": {np.bool_: np.uint8, np.float16: np.float32},
+    ".ply": {np.bool_: np.uint8, np.float16: np.float32, np.int64: np.float64, np.uint64: np.float64},
+    ".parquet": {np.float16: np.float32},
+}
 _CLOUD_KEYS = ("points", "lidar", "xyz", "pc")  # of an .npz file with more than one table
 
 
@@ -129,7 +134,7 @@ def write_cloud(
     fields = {}
     for name, values in (*zip(AXES, points.T), *named.items()):
         allowed = re.sub("[^!-~]", "_", name) if suffix in (".pcd", ".ply") else name
-        fields[allowed] = _storable(values, suffix)
+        fields[allowed] = np.ascontiguousarray(values, _WIDER.get(suffix, {}).get(values.dtype.type, values.dtype))
     if [*AXES, *named] == default_names(3 + len(named)):
         points, named = np.column_stack([points, *named.values()]), {}
     with atomic_file(path) as file:
@@ -210,18 +215,6 @@ def _checked_suffix(path: Path, suffix: str, allowed: Sequence[str] = SUFFIXES) 
 
 def _hint(path: Path) -> str:
     return "pass plain arrays, not pickled objects" if path.suffix.lower() in (".npy", ".npz") else "copy it again"
-
-
-def _storable(values: np.ndarray, suffix: str) -> np.ndarray:
-    """Return the values in a type that the format has."""
-    kind: Any = values.dtype
-    if suffix in (".pcd", ".ply") and kind == np.bool_:
-        kind = np.uint8
-    elif suffix in (".pcd", ".ply", ".parquet") and kind == np.float16:
-        kind = np.float32
-    elif suffix == ".ply" and kind in (np.int64, np.uint64):
-        kind = np.float64
-    return np.ascontiguousarray(values, kind)
 
 
 def _positions(fields: Mapping[str, np.ndarray]) -> list[np.ndarray]:
