@@ -55,12 +55,12 @@ def find_waymo_segments(root: PathLike) -> list[Path]:
             f"{root}: .tfrecord is version 1 of the Waymo Open Dataset, which we do not read; download the parquet "
             "files of version 2 (same drives): lidar, lidar_pose, lidar_calibration, vehicle_pose, lidar_box"
         )
-    return sorted(search(root, _segments_of, SEARCH_DEPTH, what))
 
+    def segments_of(split: Path) -> list[Path]:
+        files = [path for path in visible(split / "lidar") if path.suffix == ".parquet"]
+        return [split] if split.is_file() else files
 
-def _segments_of(split: Path) -> list[Path]:
-    files = [path for path in visible(split / "lidar") if path.suffix == ".parquet"]
-    return [split] if split.is_file() else files
+    return sorted(search(root, segments_of, SEARCH_DEPTH, what))
 
 
 class WaymoLog(BoxLog):
