@@ -114,7 +114,8 @@ def recognise(root: Any) -> str:
             found, marked = list(dict.fromkeys(name for name, _ in marks)), [path for _, path in marks]
             if found:
                 break
-    found = [name for name in found if _has_logs(name, root)]  # nuScenes and TruckScenes have the same file names
+    # nuScenes and TruckScenes have the same file names.
+    found = [name for name in found if not _error_of(name, root, is_opened=False)]
     # Each path with a mark, and the folders between it and the top, may be a folder of clouds that is called so.
     around = dict.fromkeys(folder for path in marked for folder in (path, *path.parents))
     if found and any(is_array_log(folder) for folder in around if folder == top or top in folder.parents):
@@ -124,7 +125,7 @@ def recognise(root: Any) -> str:
             warn(f"{root}: we read its folders of clouds, because no log of another format opens: {errors[found[0]]}")
             opened = ["arrays"]
         found = opened or found
-    if not found and _has_logs("arrays", root):
+    if not found and not _error_of("arrays", root, is_opened=False):
         found = ["arrays"]
     if len(found) != 1:
         choose = f"choose one with data={'|'.join(DATA_SETS)}"
@@ -223,17 +224,12 @@ def _why_nothing_fits(top: Path) -> str:
     return f"its {count} {suffix} files are not read: {_CONVERSIONS[suffix]}" if suffix else ""
 
 
-def _has_logs(name: str, root: Any) -> bool:
+def _error_of(name: str, root: Any, is_opened: bool = True) -> str:
+    """Return the error if there is no log of a format under a path, or the first cannot be opened; "" = there is none."""
     try:
-        return len(find_sources(name, root)) > 0
-    except CFlowError:
-        return False
-
-
-def _error_of(name: str, root: Any) -> str:
-    """Return the error if the first log under a path cannot be opened in a format; "" = it opens."""
-    try:
-        _open(name, find_sources(name, root)[0], {}).close()
+        first = find_sources(name, root)[0]
+        if is_opened:
+            _open(name, first, {}).close()
         return ""
     except CFlowError as error:
         return str(error)
