@@ -225,7 +225,7 @@ def _why_nothing_fits(top: Path) -> str:
 
 
 def _error_of(name: str, root: Any, is_opened: bool = True) -> str:
-    """Return the error if there is no log of a format under a path, or the first cannot be opened; "" = there is none."""
+    """Return the error if a path has no log of a format, or if the first one does not open; "" = there is none."""
     try:
         first = find_sources(name, root)[0]
         if is_opened:
