@@ -149,10 +149,7 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
         if does_not_fit():
             others = _pairs_without_repeats(log, poses, jumps, {index for pair in pairs for index in pair})
             again = judge(make_pairs(others, scans, False))
-            # Only a few sweeps are wrong if others fit clearly better as given, and not under the best reading.
-            is_worse = not judgement.best or again.shares.get(judgement.best[0], float("nan")) <= again.given
-            is_better = not again.best and again.given >= max(LEAST_SHARE, MARGIN * judgement.given)
-            judgement = again if is_better and is_worse else judgement
+            judgement = again if _contradicts(again, judgement) else judgement
     if hardly_moves and not judgement.best and judgement.given < _UNCLEAR:
         spread = choose_pairs(len(log.timestamps), None)
         clouds = [[replace(log.sweep(index), pose=None) for index in pair] for pair in spread]
@@ -161,6 +158,15 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     if STILL in judgement.best and log.unwrapped.has_viewpoints:
         return replace(judgement, shares={**judgement.shares, WORLD: judgement.shares[STILL]}, best=(WORLD,))
     return judgement
+
+
+def _contradicts(again: Judgement, judgement: Judgement) -> bool:
+    """Test whether other sweeps fit clearly better as given, and show that the best reading, if any, is wrong.
+
+    Then only a few sweeps are wrong, such as one that repeats the one before. Errors of measurement differ by sweep.
+    """
+    is_worse = not judgement.best or again.shares.get(judgement.best[0], float("nan")) <= again.given
+    return not again.best and is_worse and again.given >= max(LEAST_SHARE, MARGIN * judgement.given)
 
 
 def fits_better(log: Log, others: np.ndarray) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -78,15 +77,11 @@ class OwnVehicleLog(LogWrapper):
         poses = known_poses(self.log)
         chosen = [] if poses is None else _spread(poses[:, :3, 3])
         sweeps: list[np.ndarray] = []
-        clouds: list[np.ndarray] = []  # the points that are not ground
+        clouds: list[np.ndarray] = []
         for index in chosen:
             sweep = self.log.sweep(index)
             sweeps.append(as_numpy(sweep.points))
-            points = sweeps[-1][:, :3].astype(np.float64)
-            is_known = are_finite(points)
-            is_enough = (_are_near(points) & is_known).sum() >= _FEWEST_POINTS  # else it does not count
-            mask: Any = find_ground(points, "grid") if is_enough and sweep.is_ground is None else sweep.is_ground
-            clouds.append(points[is_known & ~as_numpy(mask)] if is_enough else points[:0])
+            clouds.append(_structure(sweep))
             if _are_near(clouds[-1]).sum() < _FEWEST_POINTS and index == chosen[0]:
                 return nothing  # no other sweep needs to be read
         if poses is None or not clouds:
@@ -119,6 +114,16 @@ def _spread(positions: np.ndarray) -> list[int]:
     chosen = np.searchsorted(travelled, np.linspace(0, travelled[-1], count) - 1e-9)
     away = np.linalg.norm(np.diff(positions[chosen], axis=0), axis=1)
     return chosen.tolist() if (away >= _LEAST_MOTION).all() else []  # type: ignore[no-any-return]
+
+
+def _structure(sweep: Sweep) -> np.ndarray:
+    """Return the finite points of a sweep that are not ground, (N, 3) float64."""
+    points = as_numpy(sweep.points)[:, :3].astype(np.float64)
+    finite = are_finite(points)
+    if (_are_near(points) & finite).sum() < _FEWEST_POINTS:
+        return points[:0]
+    mask = find_ground(points, "grid") if sweep.is_ground is None else sweep.is_ground
+    return points[finite & ~as_numpy(mask)]
 
 
 def _rows_in(cells: np.ndarray, points: np.ndarray) -> np.ndarray:

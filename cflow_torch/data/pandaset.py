@@ -99,8 +99,8 @@ class PandaSetLog(Log):
             category=np.zeros(len(points), np.uint8),
             is_valid=np.zeros(len(points), bool),
         )
-        fields = ("uuid", "label", "yaw", "cuboids.sensor_id", *_POSITION, *_SIZE)
-        cuboids = [_columns(file, fields) for file in files]
+        names = ("uuid", "label", "yaw", "cuboids.sensor_id", *_POSITION, *_SIZE)
+        cuboids = [_columns(file, names) for file in files]
         T_ego1_ego0 = np.linalg.inv(self._poses[index + 1]) @ self._poses[index]
         for lidar in _LIDARS:
             rows = np.flatnonzero(lidars == lidar)
@@ -109,6 +109,10 @@ class PandaSetLog(Log):
             labels.flow[rows] = of_lidar.flow
             labels.category[rows] = of_lidar.category
             labels.is_valid[rows] = of_lidar.is_valid
+        return self._with_classes(index, labels)
+
+    def _with_classes(self, index: int, labels: FlowLabels) -> FlowLabels:
+        """Take the categories from the classes of points, if there are any; see the class for which are valid."""
         classes = self._classes(index, len(labels.flow))
         if classes is None:
             return labels

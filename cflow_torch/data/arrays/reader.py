@@ -108,9 +108,7 @@ class ArraysLog(Log):
         self.files = find_clouds(self.folder, suffix)
         self.bin_layout = self._find_bin_layout(bin_columns)
         self._bin_columns: Any = self.bin_layout if bin_columns == "auto" else bin_columns
-        others = other_folders(self.folder)
-        if others:
-            self._note(f"we read the clouds in {self.files[0].parent.name}; there are others in {', '.join(others)}")
+        self._name_other_folders()
         self._ground = resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         mounting = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         stamps, table = self._known_times(times)
@@ -170,6 +168,11 @@ class ArraysLog(Log):
         """Read the columns of cloud `index` besides x, y, z, see `cloud_file.read_columns`."""
         self._timestamp(index)
         return read_columns(self.files[index], self._bin_columns)
+
+    def _name_other_folders(self) -> None:
+        others = other_folders(self.folder)
+        if others:
+            self._note(f"we read the clouds in {self.files[0].parent.name}; there are others in {', '.join(others)}")
 
     def _find_bin_layout(self, columns: Any) -> BinLayout | None:
         """Return the layout of `.bin` files; None = the files have another suffix. We say if it is not KITTI's."""

@@ -127,10 +127,7 @@ class BagLog(Log):
         hint = f"is it a complete bag of ROS 1 (.bag), ROS 2 (folder) or MCAP? {_REPAIR}"
         with file_errors(f"{self.path}", hint):
             topics = {connection.topic: connection.msgtype for connection in self._reader().connections}
-            # Without a name, Livox' messages count only if there are no others.
-            has_others = _CLOUD in topics.values() or not set(_LIVOX) & set(topics.values())
-            kinds = (_CLOUD,) if has_others and not topic else (_CLOUD, *_LIVOX)
-            self.topic = self._chosen(topics, kinds, topic, "topic")
+            self.topic = self._cloud_topic(topics, topic)
             self._clouds, tracks = self._scan()
             self.frame = frame or self._ego_frame()
             self.timestamps = sorted(self._clouds)
@@ -140,6 +137,11 @@ class BagLog(Log):
                 self._use_poses(trajectory, f"{self.path}: {self.topic}, while there are poses,")
             self._period = float(np.median(np.diff(self.timestamps))) * 1e-9
             self.lidar_position = self._mount_at(self.timestamps[0])[:3, 3]
+
+    def _cloud_topic(self, topics: dict[str, str], name: str | None) -> str:
+        """Return the topic of the clouds; without a name, Livox' messages count only if there are no others."""
+        has_clouds = _CLOUD in topics.values() or not set(_LIVOX) & set(topics.values())
+        return self._chosen(topics, (_CLOUD,) if has_clouds and not name else (_CLOUD, *_LIVOX), name, "topic")
 
     def _find_poses(self, topics: dict[str, str], poses: str | None, tracks: dict[str, Any]) -> Trajectory | None:
         """Return the poses of the file, topic or transforms that `poses` names or finds; None = there are none.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Sequence
 from xml.etree import ElementTree
 
 import numpy as np
@@ -81,12 +81,12 @@ def read_tracklets(file: Path) -> dict[int, FrameBoxes]:
                     rows.setdefault(first_frame + step, []).append(
                         (str(number), track.findtext("objectType"), size, place)
                     )
-    found = {}
-    for frame, of_frame in rows.items():
-        tracks, kinds, sizes, places = zip(*of_frame)
-        boxes = Boxes(tracks, category_indices(kinds, CATEGORY_NAME), sizes, upright_poses(places))
-        found[frame] = NO_BOXES._replace(boxes=boxes)
-    return found
+    return {frame: _upright(*zip(*of_frame)) for frame, of_frame in rows.items()}
+
+
+def _upright(tracks: Sequence[str], kinds: Sequence[str], sizes: Any, places: Any) -> FrameBoxes:
+    boxes = Boxes(tracks, category_indices(kinds, CATEGORY_NAME), sizes, upright_poses(places))
+    return NO_BOXES._replace(boxes=boxes)
 
 
 def read_tracking_labels(file: Path, T_lidar_camera: np.ndarray) -> dict[int, FrameBoxes]:
