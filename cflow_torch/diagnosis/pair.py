@@ -9,7 +9,7 @@ from typing import Callable, Sequence
 import numpy as np
 
 from cflow_torch.diagnosis.conventions import MOUNTS, OFF, READINGS, REVERSED, SCAN_READINGS, STILL, TIMES, UNITS, WORLD
-from cflow_torch.diagnosis.stillness import FEWEST_POINTS, Structure, cell_keys, structure_rows
+from cflow_torch.diagnosis.stillness import FEWEST_POINTS, Structure, structure_rows
 from cflow_torch.transforms import as_matrix, rigid_transform
 from cflow_torch.types import Array, Sweep, as_numpy
 
@@ -108,13 +108,16 @@ def make_pair(
         in_world = has_poses and is_around(pc1.points, poses[1])
     centre = poses[1, :3, 3] if in_world else np.zeros(3)
     rows_of = [structure_rows(sweep, centre) for sweep in (pc0, pc1)]
-    if min(map(len, rows_of)) < FEWEST_POINTS or _num_blocks(_as_it_is(pc0, rows_of[0], OFF)) < _FEWEST_BLOCKS:
+    blocks = np.floor(_as_it_is(pc0, rows_of[0], OFF)[:, :2] / _BLOCK) @ (1 << 20, 1)
+    if min(map(len, rows_of)) < FEWEST_POINTS or len(np.unique(blocks)) < _FEWEST_BLOCKS:
         return None
     rows_of[0] = rows_of[0][: _TIMED_POINTS if TIMES in scans else MOST_POINTS]
     clouds = [_cloud(*each, centre) for each in zip((pc0, pc1), rows_of, deskew)]
     transforms = _transforms(poses if around is None else around, rows) if has_poses else {GIVEN: np.eye(4)}
     if in_world:
-        transforms = {name: _about(centre, T) for name, T in transforms.items()}
+        # For points relative to the centre.
+        about = {name: (T[:3, :3], T[:3, :3] @ centre + T[:3, 3] - centre) for name, T in transforms.items()}
+        transforms = {name: as_matrix(*parts) for name, parts in about.items()}
         transforms[WORLD] = transforms.pop(STILL)
     has_motion = has_poses and (in_world or bool(difference(transforms[GIVEN], np.eye(4)) >= LEAST_MOTION))
     is_sparse = min(len(pc0.points), len(pc1.points)) < _SPARSE
@@ -161,15 +164,3 @@ def difference(T: np.ndarray, other: np.ndarray) -> np.ndarray:
     apart = T - other
     rotation = np.linalg.norm(apart[..., :3, :3], axis=(-2, -1)) / np.sqrt(2)
     return np.linalg.norm(apart[..., :3, 3], axis=-1) + ARM * rotation  # type: ignore[no-any-return]
-
-
-def _num_blocks(points: np.ndarray) -> int:
-    """Return how many blocks of 5 m in the plane hold points."""
-    block = np.floor(points / _BLOCK).astype(np.int64)
-    block[:, 2] = 0
-    return len(np.unique(cell_keys(block)))
-
-
-def _about(centre: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Return a transform for points relative to `centre`."""
-    return as_matrix(T[:3, :3], T[:3, :3] @ centre + T[:3, 3] - centre)

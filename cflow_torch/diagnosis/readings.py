@@ -26,7 +26,7 @@ from cflow_torch.diagnosis.conventions import (
     UNITS,
     WORLD,
     Reading,
-    scaled,
+    scale_poses,
 )
 from cflow_torch.diagnosis.other_frame import find_motion, motion_of, mounting, mounting_of, place_of, rotation_between
 from cflow_torch.diagnosis.pair import COMPARED, GIVEN, LEAST_MOTION, MOST_POINTS, Pair, difference
@@ -245,7 +245,7 @@ def _readings_of_motions(pairs: Sequence[Pair], scan: str, motions: Sequence[np.
     if scale > _RESCALED or 1e-9 < scale < 1 / _RESCALED:
         found[SCALED] = Reading(
             f"the positions of the poses are {1 / scale:.3g} times as long as the motion of the points",
-            scaled(scale),
+            partial(scale_poses, scale),  # picklable
             fix=f"positions multiplied by {scale:.3g}, unless the points have another unit (feet)",
         )
     return found
