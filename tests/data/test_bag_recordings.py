@@ -145,6 +145,21 @@ def test_a_missing_link_is_named(tmp_path) -> None:
     assert log.frame == "base_link" and world(log, bag.recording) < 5e-3
 
 
+def test_a_bag_next_to_one_without_poses_is_named_if_it_has_some(tmp_path, recwarn) -> None:
+    """Clouds and transforms were recorded into two bags; a third one is of another time."""
+    bag = Recorder(tmp_path / "clouds")
+    bag.clouds()
+    clouds = bag.close().rename(tmp_path / "lidar.bag")
+    for name, start, end in (("later", 900, 901), ("poses", -2, 20)):
+        bag = Recorder(tmp_path / name)
+        bag.mount() if name == "poses" else None
+        bag.drive(start, end)
+        bag.close().rename(tmp_path / f"{name}.bag")
+    (note,) = BagLog(clouds).notes
+    assert note.startswith("poses.bag next to it has /tf of the same time, which we do not read: merge both by ")
+    assert note.endswith("rosbags-convert --src lidar.bag poses.bag --dst merged")
+
+
 def test_transforms_connect_frames_in_either_direction(tmp_path) -> None:
     """The vehicle below its LiDAR, and the frame of the world below the vehicle, as KISS-ICP publishes it."""
     mounted = Recorder(tmp_path / "mount")

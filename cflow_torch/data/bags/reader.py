@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import closing, suppress
 from importlib.metadata import version
 from operator import methodcaller
 from pathlib import Path
@@ -50,6 +51,8 @@ _REPAIR = "a recording that was cut off is repaired by rosbag reindex (.bag), mc
 _POSE_TYPES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/Pose{name}Stamped" for name in ("", "WithCovariance")))
 _OTHER_POSES = ("nav_msgs/msg/Path", "geometry_msgs/msg/TransformStamped")  # used if there are no others
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_MOVING = (*_TF_TYPES, *_POSE_TYPES)
+_MOST_OTHERS = 10  # bags next to one without poses, in which we look for some
 _ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by less
 _LARGEST_DELAY = 500_000_000  # nanoseconds by which messages arrive later than others
 _EARLY = 100_000_000  # nanoseconds; a message that arrives so long before its time has another clock than the recorder
@@ -169,7 +172,25 @@ class BagLog(Log):
         if poses is None:
             return None
         fits = methodcaller("covers", self.timestamps)
-        return find_poses_near(self.path.parent, self.log_id, self.timestamps, fits, self._note)
+        near = find_poses_near(self.path.parent, self.log_id, self.timestamps, fits, self._note)
+        if near is None:
+            self._note(self._other_bag_with_poses())
+        return near
+
+    def _other_bag_with_poses(self) -> str:
+        """Name a bag next to this one that has poses of the same time; "" = there is none."""
+        arrived = [arrival for arrival, _ in self._clouds.values()]
+        parent = self.path.resolve().parent
+        folders = [parent, *(path for path in visible(parent) if path.is_dir())]
+        bags = [bag for folder in folders for bag in _bags_in(folder) if not bag.samefile(self.path)]
+        for bag in sorted(bags)[:_MOST_OTHERS]:
+            parts = _parts(bag)
+            moving = _topics_of_poses(parts, min(arrived), max(arrived))
+            if moving:
+                files = " ".join([*(file.name for file in self._files), *(str(p.relative_to(parent)) for p in parts)])
+                what = f"{bag.relative_to(parent)} next to it has {', '.join(moving)} of the same time"
+                return f"{what}, which we do not read: merge both by rosbags-convert --src {files} --dst merged"
+        return ""
 
     def _mount_at(self, time: int) -> np.ndarray:
         """Return `T_ego_lidar` at a time, (4, 4) float64."""
@@ -469,6 +490,16 @@ def _open_bag(files: list[Path]) -> Any:
     reader = rosbags.AnyReader(files, default_typestore=types_of_old_bags)
     reader.open()
     return reader
+
+
+def _topics_of_poses(files: list[Path], first_ns: int, last_ns: int) -> list[str]:
+    """Return the topics of a bag that have poses or moving transforms, if it has messages between two times."""
+    # Any error of a library is ignored, because nobody has given these files.
+    with suppress(Exception), closing(_open_bag(files)) as reader:
+        if reader.start_time <= last_ns and reader.end_time >= first_ns:
+            kinds = {each.topic: each.msgtype for each in reader.connections}
+            return sorted(topic for topic, kind in kinds.items() if kind in _MOVING and topic != "/tf_static")
+    return []
 
 
 def _parts(path: Path, files: Sequence[Path] | None = None) -> list[Path]:
