@@ -116,7 +116,11 @@ class AV2Log(BoxLog):
         self.timestamps = sorted(self._files)
         self._check_count(f"{self.folder}: sensors/lidar/<nanoseconds>.feather")
         self._driven = self._read_trajectory()
-        self._poses = None if self._driven is None else self._pose_per_sweep(self._driven)
+        self._poses = None
+        if self._driven is not None:
+            self._poses, is_known, note = fit_to_sweeps(self._driven, self.timestamps)
+            self._note(note)
+            self._keep(is_known, f"{self.folder}: without the sweeps that have no pose, it")
         if ground is not None and ground not in GROUND_RULES:
             raise CFlowError(f"ground rules are {sorted(GROUND_RULES)}, got {ground!r}")
         self._rule, self._raster = ground, read_ground_raster(self.folder / "map") if ground else None
@@ -130,13 +134,6 @@ class AV2Log(BoxLog):
         stored = FeatherFile(file)
         times, rows = np.unique(stored.vector("timestamp_ns", np.int64), return_index=True)
         return Trajectory(_poses(stored, rows, times.tolist()), times, False, str(file))
-
-    def _pose_per_sweep(self, trajectory: Trajectory) -> np.ndarray:
-        """Return the poses of the sweeps, (K, 4, 4), and leave out sweeps that have none."""
-        poses, is_known, note = fit_to_sweeps(trajectory, self.timestamps)
-        self._note(note)
-        self._keep(is_known, f"{self.folder}: without the sweeps that have no pose, it")
-        return poses
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`, with a ground mask if the log has a raster and poses."""

@@ -16,7 +16,7 @@ from typing import Any, Iterator, Mapping, NamedTuple, Sequence, overload
 from cflow_torch.data.deskewing import DeskewedLog, check_deskew
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.finding import FOUND, Finding
-from cflow_torch.data.folders import distinct_names, find_folders, levels
+from cflow_torch.data.folders import find_folders, levels
 from cflow_torch.data.log import CachedLog, Log, LogWrapper, add_gaps_in_time, typical_sweeps
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
@@ -100,6 +100,8 @@ def recognise(root: Any) -> str:
 
     Cost: next to folders of point clouds, the first log of each format that fits is opened.
     """
+    from cflow_torch.data.arrays.folder import is_array_log
+
     top = as_path(root)
     with remote_errors(top):
         if not top.exists():
@@ -112,15 +114,18 @@ def recognise(root: Any) -> str:
             found, marked = list(dict.fromkeys(name for name, _ in marks)), [path for _, path in marks]
             if found:
                 break
-    found = [name for name in found if _has_logs(name, root)]  # nuScenes and TruckScenes have the same file names
-    if found and _have_clouds(marked, top):  # folders of other data sets may be called so
+    # nuScenes and TruckScenes have the same file names.
+    found = [name for name in found if not _error_of(name, root, is_opened=False)]
+    # Each path with a mark, and the folders between it and the top, may be a folder of clouds that is called so.
+    around = dict.fromkeys(folder for path in marked for folder in (path, *path.parents))
+    if found and any(is_array_log(folder) for folder in around if folder == top or top in folder.parents):
         errors = {name: _error_of(name, root) for name in found}
         opened = [name for name in found if not errors[name]]
         if not opened and not _error_of("arrays", root):
             warn(f"{root}: we read its folders of clouds, because no log of another format opens: {errors[found[0]]}")
             opened = ["arrays"]
         found = opened or found
-    if not found and _has_logs("arrays", root):
+    if not found and not _error_of("arrays", root, is_opened=False):
         found = ["arrays"]
     if len(found) != 1:
         choose = f"choose one with data={'|'.join(DATA_SETS)}"
@@ -134,14 +139,6 @@ def _paths_below(top: Path) -> Iterator[list[Path]]:
     yield [top]
     for level in levels(top, _DEEPEST):
         yield [path for _, inside in level for path in inside]
-
-
-def _have_clouds(marked: Sequence[Path], top: Path) -> bool:
-    """Test whether one of the marked paths, or a folder between it and the top, is a folder of point clouds."""
-    from cflow_torch.data.arrays.folder import is_array_log
-
-    around = dict.fromkeys(folder for path in marked for folder in (path, *path.parents))  # each only once
-    return any(is_array_log(folder) for folder in around if folder == top or top in folder.parents)
 
 
 def matching_paths(path: Any) -> list[Any]:
@@ -174,11 +171,16 @@ def find_all_sources(name: str, paths: Sequence[Any]) -> list[Any]:
 
 
 def _with_distinct_names(sources: Sequence[Any]) -> list[Any]:
-    """Rename logs of equal names, as results of both would be in one folder."""
+    """Put names of parent folders in front of equal names of logs, as results of both would be in one folder."""
     places = [getattr(source, "folder", source) for source in sources]
     names = [place.name if place.is_dir() else place.stem for place in places]
     above = [[part for part in place.absolute().parts[-2:0:-1] if part not in _OF_LAYOUTS] for place in places]
-    distinct = distinct_names(names, above)
+    distinct = list(names)
+    for depth in range(1, 1 + max(map(len, above), default=0)):
+        counts = Counter(distinct)
+        for k, parents in enumerate(above):
+            if counts[distinct[k]] > 1:
+                distinct[k] = "-".join([*parents[:depth][::-1], names[k]])
     renamed = zip(sources, names, distinct)
     return [source if name == other else RenamedSource(source, other) for source, name, other in renamed]
 
@@ -215,28 +217,19 @@ def _why_nothing_fits(top: Path) -> str:
     known = [kind for kind, _ in suffixes.most_common() if kind in (*_CONVERSIONS, *SUFFIXES)]
     suffix = min(known, key=lambda kind: kind in TEXTS, default="")
     count = suffixes[suffix]
-    clouds = [kind for kind in suffixes if kind in SUFFIXES] or [kind for kind in suffixes if kind in TEXTS]
-    clouds = [] if suffix in _CONVERSIONS and suffix not in TEXTS else clouds
-    if clouds and all(suffixes[kind] == 1 for kind in clouds):
-        return f"it has one file of points ({clouds[0]}); scene flow needs a file for each of two sweeps or more"
-    if clouds and clouds[0] in SUFFIXES:
-        return f"its {suffixes[clouds[0]]} {clouds[0]} files lie alone in their folders: put those of a log into one"
-    if suffix in _CONVERSIONS:
-        return f"its {count} {suffix} files are not read: {_CONVERSIONS[suffix]}"
-    return ""
+    if count == 1 and suffix in (*SUFFIXES, *TEXTS):
+        return f"it has one file of points ({suffix}); scene flow needs a file for each of two sweeps or more"
+    if suffix in SUFFIXES:
+        return f"its {count} {suffix} files lie alone in their folders: put those of a log into one"
+    return f"its {count} {suffix} files are not read: {_CONVERSIONS[suffix]}" if suffix else ""
 
 
-def _has_logs(name: str, root: Any) -> bool:
+def _error_of(name: str, root: Any, is_opened: bool = True) -> str:
+    """Return the error if a path has no log of a format, or if the first one does not open; "" = there is none."""
     try:
-        return len(find_sources(name, root)) > 0
-    except CFlowError:
-        return False
-
-
-def _error_of(name: str, root: Any) -> str:
-    """Return the error if the first log under a path cannot be opened in a format; "" = it opens."""
-    try:
-        _open(name, find_sources(name, root)[0], {}).close()
+        first = find_sources(name, root)[0]
+        if is_opened:
+            _open(name, first, {}).close()
         return ""
     except CFlowError as error:
         return str(error)

@@ -73,17 +73,15 @@ class DeskewedLog(LogWrapper):
 
     def findings(self) -> list[Finding]:
         note = self._note_of(self.scan) if self._deskew == "auto" else ""
-        found = Finding("de-skewing", FOUND, note, True) if note else Finding("de-skewing", RIGHT, self._describe())
-        return [*self.log.findings(), found]
-
-    def _describe(self) -> str:
-        if self._deskew != "auto":
-            return f"as you say, deskew={self._deskew}"
         times = self.log.sweep(0).point_times
-        if times is None:
-            return "no times of points, and no other reading fits clearly better than as stored"
-        spread = np.ptp(as_numpy(times)) if len(times) else 0.0
-        return f"points have times over {spread:.3f} s"
+        if self._deskew != "auto":
+            text = f"as you say, deskew={self._deskew}"
+        elif times is None:
+            text = "no times of points, and no other reading fits clearly better than as stored"
+        else:
+            text = f"points have times over {np.ptp(as_numpy(times)) if len(times) else 0.0:.3f} s"
+        found = Finding("de-skewing", FOUND, note, True) if note else Finding("de-skewing", RIGHT, text)
+        return [*self.log.findings(), found]
 
     @cached_property
     def _scans(self) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, Callable, Iterator, Sequence, TypeVar
@@ -28,11 +28,14 @@ def search(
 
     We do not search below folders in which something is found, in hidden folders, in folders of flow that we computed,
     or in folders for which `is_passed` is False. Clean logs that we wrote count only if there are no others. A chain of
-    folders below the root, each alone, costs no depth. A root that is not a folder is a `CFlowError`, which says `what`
-    to pass.
+    folders below the root, each alone, costs no depth. A root that is a file is a `CFlowError`, which says `what` to
+    pass, unless `find` returns something for it.
     """
     if not root.is_dir():
-        raise CFlowError(f"{root} is not a folder; pass {what}")
+        of_file = list(find(root)) if root.is_file() else []
+        if not of_file:
+            raise CFlowError(f"{root} is not a folder; pass {what}")
+        return of_file
     found: list[_T] = []
     clean: list[_T] = []
     for level in levels(root, depth):
@@ -71,15 +74,11 @@ def find_folders(root: Path, is_log: Callable[[Path], bool], depth: int, what: s
 
 def record_in(files: Sequence[Path]) -> str:
     """Return the name of the record among the files of a folder of results that we wrote; "" = it is none of ours."""
-    records = [path for path in files if path.name in (_OF_FLOW, _OF_CLEAN)]
-    return next((path.name for path in records if _is_ours(path)), "")
-
-
-def _is_ours(file: Path) -> bool:
-    try:
-        return file.is_file() and _OURS in read_bytes(file)
-    except (OSError, CFlowError):  # of another user
-        return False
+    for path in files:
+        with suppress(OSError, CFlowError):  # of another user
+            if path.name in (_OF_FLOW, _OF_CLEAN) and path.is_file() and _OURS in read_bytes(path):
+                return path.name
+    return ""
 
 
 def visible(folder: Path) -> list[Path]:
@@ -95,14 +94,3 @@ def visible(folder: Path) -> list[Path]:
 def natural_key(name: str) -> tuple[Any, ...]:
     """Return a key for sorting that compares digits in names as numbers: 2 before 10."""
     return tuple((0, int(run), run) if run.isdecimal() else (1, 0, run) for run in re.findall(r"\d+|\D+", name))
-
-
-def distinct_names(names: Sequence[str], above: Sequence[Sequence[str]]) -> list[str]:
-    """Put names of parent folders (`above`, nearest first) in front of equal names, as many as it needs."""
-    found = list(names)
-    for depth in range(1, 1 + max(map(len, above), default=0)):
-        counts = Counter(found)
-        for k, parents in enumerate(above):
-            if counts[found[k]] > 1:
-                found[k] = "-".join([*parents[:depth][::-1], names[k]])
-    return found

@@ -12,6 +12,7 @@ from torch.utils.data import Dataset
 
 from cflow_torch.data.camera import Camera
 from cflow_torch.data.finding import Finding
+from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
 from cflow_torch.diagnosis.pair import LEAST_DISTANCE, is_around
 from cflow_torch.diagnosis.readings import Judgement
 from cflow_torch.errors import warn
@@ -268,6 +269,17 @@ class Log(ABC):
         if not 0 <= index < len(self.timestamps):
             raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self) - 1}, you asked for {index}")
         return self.timestamps[index]
+
+    def _use_poses(self, trajectory: Trajectory, where: Any) -> np.ndarray:
+        """Take poses with times, keep the sweeps that have one, with a note, and return their indices.
+
+        `where` as in `_check_count`.
+        """
+        self.poses, is_covered, note = fit_to_sweeps(trajectory, self.timestamps)
+        self._note(note)
+        self.has_sparse_poses = trajectory.is_sparse(self.timestamps)
+        self.trajectory = np.asarray(trajectory.times_ns), trajectory.poses
+        return self._keep(is_covered, where)
 
     def _keep(self, is_kept: np.ndarray, where: Any) -> np.ndarray:
         """Leave out sweeps, (K,) bool, with gaps in their places, and return the indices of the others.

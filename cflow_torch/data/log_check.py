@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
+from operator import methodcaller
 from typing import Any, Callable, Iterable, Iterator, List
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses, typical_sweeps
 from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, judge_log
-from cflow_torch.data.neighbours import Neighbours, middle_sweeps
+from cflow_torch.data.neighbours import Neighbours
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
 from cflow_torch.diagnosis.inspection import mask_problem, repeats
@@ -25,6 +26,7 @@ from cflow_torch.transforms import relative_transform, transform_points
 from cflow_torch.types import Array, Sweep, as_numpy
 
 _CACHED = 12  # sweeps that several checks read
+_ALTERNATING = 8  # sweeps in the middle of a log that tell whether two sensors alternate
 _STRIP = 4.0  # metres, half width of the strip whose points are looked for in the next sweep
 _SAMPLE = 1000  # points of the strip that are looked for
 _SAME = 0.001  # metres between two equal points
@@ -104,8 +106,10 @@ class _CheckedLog(CachedLog):
     @cached_property
     def misfit(self) -> list[Finding]:
         """Why neighbouring sweeps do not fit whatever the poses: they measure other directions, or alternate."""
-        parts = _parts(self)
-        return parts or ([_TWO_SENSORS] if Neighbours.of(self, middle_sweeps(self)).alternate else [])
+        count = min(_ALTERNATING, len(self))
+        first = (len(self) - count) // 2
+        middle = range(first, first + count)
+        return _parts(self) or ([_TWO_SENSORS] if Neighbours.of(self, middle).alternate else [])
 
     @cached_property
     def lapses(self) -> list[Lapse]:
@@ -114,6 +118,7 @@ class _CheckedLog(CachedLog):
 
 
 _Check = Callable[[_CheckedLog], List[Finding]]
+_FOUND: _Check = methodcaller("findings")
 
 
 def check_log(log: Log) -> None:
@@ -129,7 +134,7 @@ def find_problems(log: Log) -> list[str]:
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """
-    findings = _collect(_CheckedLog(log, _CACHED), (_found, _empty, _frame, _mask, _repeated, _lapses))
+    findings = _collect(_CheckedLog(log, _CACHED), (_FOUND, _frame, _mask, _repeated, _lapses))
     return [finding.text for finding in findings if finding.status != RIGHT and finding.is_quick]
 
 
@@ -140,8 +145,7 @@ def examine(log: Log) -> list[Finding]:
     """
     checks = (
         _sensor,
-        _found,
-        _empty,
+        _FOUND,
         _frame,
         _times,
         _poses,
@@ -171,24 +175,14 @@ def _collect(log: _CheckedLog, checks: Iterable[_Check], tells_errors: bool = Fa
     return sorted(found, key=lambda finding: _TOPICS.index(finding.topic))
 
 
-def _found(log: Log) -> list[Finding]:
-    return log.findings()
-
-
-def _empty(log: _CheckedLog) -> list[Finding]:
-    if not log.is_empty:
-        return []
-    names = ", ".join(map(_name_of, log.typical))
-    return [Finding("sweeps", WRONG, f"no point is finite in {names}: are the files complete?", True)]
-
-
 def _frame(log: _CheckedLog) -> list[Finding]:
     """Check a typical sweep; without poses also the last one, which is far away if points are in the world's frame.
 
     Then check the ego motion in the frame that the points will have.
     """
     if log.is_empty:
-        return []
+        names = ", ".join(map(_name_of, log.typical))
+        return [Finding("sweeps", WRONG, f"no point is finite in {names}: are the files complete?", True)]
     reading, problem = log.frame
     checked = log.typical[0]
     is_last = not problem and known_poses(log) is None
@@ -406,28 +400,20 @@ def _each_sweep(log: _CheckedLog) -> list[Finding]:
     """Read every sweep: find those that cannot be read, have few points, repeat the one before, or are misplaced."""
     log.sweep(0)  # its error is that of the log
     neighbours = Neighbours.of(log, range(len(log)))
-    misplaced = _collect(log, [partial(_misplaced, neighbours=neighbours)])  # may need a sweep that cannot be read
-    return [*_unreadable(neighbours), *_small(neighbours), *misplaced]
-
-
-def _unreadable(neighbours: Neighbours) -> list[Finding]:
-    errors = neighbours.errors
-    if not errors:
-        return []
-    first = min(errors)
-    count = f"{len(errors)} of {len(errors) + len(neighbours.num_points)} sweeps cannot be read"
-    text = f"{count}, the first is sweep {first}: {errors[first]}. Their pairs have no flow"
-    return [Finding("sweeps", WRONG, text)]
-
-
-def _small(neighbours: Neighbours) -> list[Finding]:
-    small = neighbours.small
-    if not small:
-        return []
-    index = min(small)
-    text = f"{len(small)} of them have few points, the first is sweep {index} with {neighbours.num_points[index]:,}"
-    fix = "are their files complete? Else leave these sweeps out"
-    return [Finding("sweeps", WRONG, f"{text}, while those around it have {small[index]:,}: {fix}")]
+    errors, small = neighbours.errors, neighbours.small
+    findings = []
+    if errors:
+        first = min(errors)
+        text = f"{len(errors)} of {len(log)} sweeps cannot be read, the first is sweep {first}: {errors[first]}"
+        findings.append(Finding("sweeps", WRONG, f"{text}. Their pairs have no flow"))
+    if small:
+        first = min(small)
+        text = f"{len(small)} of them have few points, the first is sweep {first} with {neighbours.num_points[first]:,}"
+        fix = "are their files complete? Else leave these sweeps out"
+        findings.append(Finding("sweeps", WRONG, f"{text}, while those around it have {small[first]:,}: {fix}"))
+    with suppress(CFlowError, OSError):  # of a sweep that cannot be read
+        findings += _misplaced(log, neighbours)
+    return findings
 
 
 def _misplaced(log: _CheckedLog, neighbours: Neighbours) -> list[Finding]:

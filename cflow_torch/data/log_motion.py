@@ -137,19 +137,22 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
         is_as_good = STILL in judgement.best or not in_world.fits < EQUAL * judgement.fits
         if WORLD in in_world.best and is_as_good:
             return in_world
-    hardly_moves = poses is not None and _hardly_move(poses)
-    if poses is not None and _does_not_fit(judgement, hardly_moves):  # are only a few sweeps wrong?
+    hardly_moves = False
+    if poses is not None:  # points 20 m away move by less than 0.1 m in most sweep intervals
+        speed = difference(_motions(poses, slice(-1), slice(1, None)), np.eye(4))
+        hardly_moves = bool(np.median(speed) < _LEAST_TIMED)
+
+    def does_not_fit() -> bool:
+        return bool(judgement.best) or (judgement.is_low and not hardly_moves)
+
+    if poses is not None and does_not_fit():  # are only a few sweeps wrong?
         pairs = _pairs_without_repeats(log, poses, jumps, ()) or chosen  # all may repeat the one before
         judgement = judgement if pairs == chosen else judge(make_pairs(pairs, scans, False))
-        if _does_not_fit(judgement, hardly_moves):
+        if does_not_fit():
             others = _pairs_without_repeats(log, poses, jumps, {index for pair in pairs for index in pair})
-            prepared = [pair for pair in make_pairs(others, scans, False) if pair is not None]
-            if judgement.is_small or _fit_as_given(prepared, judgement):
-                again = judge(prepared)
-                confirmed = judgement.confirmed_by(again) if again.shares else judgement
-                judgement = again if _contradicts(again, judgement) else confirmed
-    is_unclear = not judgement.best and judgement.given < _UNCLEAR
-    if is_unclear and hardly_moves:
+            again = judge(make_pairs(others, scans, False))
+            judgement = again if _contradicts(again, judgement) else judgement.confirmed_by(again)
+    if hardly_moves and not judgement.best and judgement.given < _UNCLEAR:
         spread = choose_pairs(len(log.timestamps), None)
         clouds = [[replace(log.sweep(index), pose=None) for index in pair] for pair in spread]
         unposed = judge(make_pair(pc0, pc1) for pc0, pc1 in clouds)
@@ -159,15 +162,13 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     return judgement
 
 
-def _does_not_fit(judgement: Judgement, hardly_moves: bool) -> bool:
-    """Test whether another reading is better or, if the poses move, little of the structure is in place."""
-    return bool(judgement.best) or (judgement.is_low and not hardly_moves)
+def _contradicts(again: Judgement, judgement: Judgement) -> bool:
+    """Test whether other sweeps fit clearly better as given, and show that the best reading, if any, is wrong.
 
-
-def _hardly_move(poses: np.ndarray) -> bool:
-    """Test whether points 20 m away move by less than 0.1 m in most sweep intervals."""
-    first = np.arange(len(poses) - 1)
-    return bool(np.median(difference(_motions(poses, first, first + 1), np.eye(4))) < _LEAST_TIMED)
+    Then only a few sweeps are wrong, such as one that repeats the one before. Errors of measurement differ by sweep.
+    """
+    is_worse = not judgement.best or again.shares.get(judgement.best[0], float("nan")) <= again.given
+    return not again.best and is_worse and again.given >= max(LEAST_SHARE, MARGIN * judgement.given)
 
 
 def fits_better(log: Log, others: np.ndarray) -> bool:
@@ -196,30 +197,6 @@ def _pairs_without_repeats(
         if not repeated:
             return pairs
         excluded |= repeated
-
-
-def _fit_as_given(pairs: Sequence[Pair], judgement: Judgement) -> bool:
-    """Test whether so much of the structure of other pairs is in place as given that they may contradict a judgement.
-
-    Most do not, so we need not judge them.
-    """
-    shown = [pair for pair in pairs if pair.has_motion] or pairs
-    scans = {OFF}.union(*(pair.scans for pair in shown)) if shown else ()
-    return any(np.mean([pair.share(scan) for pair in shown]) >= _least_share(judgement) for scan in scans)
-
-
-def _least_share(judgement: Judgement) -> float:
-    """Return the share as given, from which other pairs fit clearly better than those of a judgement."""
-    return max(LEAST_SHARE, MARGIN * judgement.given)
-
-
-def _contradicts(again: Judgement, judgement: Judgement) -> bool:
-    """Test whether other sweeps fit clearly better as given, and show that the best reading, if any, is wrong.
-
-    Then only a few sweeps are wrong, such as one that repeats the one before. Errors of measurement differ by sweep.
-    """
-    is_worse = not judgement.best or again.shares.get(judgement.best[0], float("nan")) <= again.given
-    return not again.best and is_worse and again.given >= _least_share(judgement)
 
 
 def _make_pairs(

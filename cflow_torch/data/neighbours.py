@@ -20,7 +20,6 @@ from cflow_torch.errors import CFlowError
 from cflow_torch.types import Sweep, as_numpy
 
 _AROUND = 10  # sweeps on each side that tell a usual share, or number of points
-_ALTERNATING = 8  # sweeps that tell whether two sensors alternate
 _FEW = 0.5  # part of the usual number of points, below which a sweep has few
 
 
@@ -97,13 +96,6 @@ class Neighbours(NamedTuple):
             if has_ends or last >= first:
                 runs.append((first, last))
         return runs
-
-
-def middle_sweeps(log: Log) -> range:
-    """Return up to eight sweeps in the middle of a log, which tell whether two sensors alternate."""
-    count = min(_ALTERNATING, len(log.timestamps))
-    first = (len(log.timestamps) - count) // 2
-    return range(first, first + count)
 
 
 def _median(values: np.ndarray) -> float:

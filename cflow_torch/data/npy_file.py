@@ -11,17 +11,10 @@ from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import read_bytes
 
 
-def read_npy(path: Path, hint: str) -> np.ndarray:
-    """Read the array of a .npy file; pickled objects are never loaded. Errors as in `file_errors`."""
+def read_npy(path: Path, hint: str, content: bytes | None = None) -> np.ndarray:
+    """Read the array of a .npy file, or of its `content`; pickled objects are never loaded. Errors: `file_errors`."""
     with file_errors(path, hint):
-        content = read_bytes(path)
-    return parse_npy(content, path, hint)
-
-
-def parse_npy(content: bytes, path: Path, hint: str) -> np.ndarray:
-    """Return the array in the content of a .npy file, see `read_npy`."""
-    with file_errors(path, hint):
-        array = np.load(io.BytesIO(content), allow_pickle=False)
+        array = np.load(io.BytesIO(read_bytes(path) if content is None else content), allow_pickle=False)
         if not isinstance(array, np.ndarray):
             raise ValueError("it is an archive, not a .npy file")
         return array

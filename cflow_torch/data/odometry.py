@@ -62,28 +62,23 @@ class Odometry:
             raise CFlowError(f"{name} has fewer than {_FEWEST_POINTS} points within {_MAX_RANGE:g} m")
         prepared = self._gicp.preprocess_points(points, _VOXEL, _NUM_NEIGHBOURS, 1)
         if self._newest is not None:
-            start = self._T_ego1_ego0 if T_ego1_ego0 is None else T_ego1_ego0
-            self._T_ego1_ego0 = rigid_transform(self._align(prepared, start), f"the estimated motion to {name}")
+            target, tree = prepared
+            source, _ = self._newest
+            motion = self._T_ego1_ego0 if T_ego1_ego0 is None else T_ego1_ego0
+            for farthest in _FARTHEST:
+                motion = self._gicp.align(
+                    target,
+                    source,
+                    tree,
+                    motion,
+                    registration_type="GICP",
+                    num_threads=1,
+                    max_correspondence_distance=farthest,
+                ).T_target_source
+            self._T_ego1_ego0 = rigid_transform(motion, f"the estimated motion to {name}")
             self._pose = self._pose @ np.linalg.inv(self._T_ego1_ego0)
         self._newest = prepared
         return self._pose.copy()
-
-    def _align(self, prepared: Any, T_ego1_ego0: np.ndarray) -> np.ndarray:
-        """Align the newest sweep, ego0, with the next one, ego1, which `preprocess_points` returned."""
-        target, tree = prepared
-        source, _ = self._newest
-        for farthest in _FARTHEST:
-            result = self._gicp.align(
-                target,
-                source,
-                tree,
-                T_ego1_ego0,
-                registration_type="GICP",
-                num_threads=1,
-                max_correspondence_distance=farthest,
-            )
-            T_ego1_ego0 = result.T_target_source
-        return T_ego1_ego0
 
 
 def estimate_poses(log: Log) -> np.ndarray:

@@ -129,7 +129,9 @@ def _structure(sweep: Sweep) -> np.ndarray:
 def _rows_in(cells: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the rows of points in cells of the vehicle or next to them, (K,) int64."""
     near = np.flatnonzero(_are_near(points))
-    return near[_contains(_dilated(cells), _cells_of(points[near]))]  # type: ignore[no-any-return]
+    offsets = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), -1).reshape(-1, 3)
+    around = (cells[:, None] + offsets).reshape(-1, 3)
+    return near[_contains(around, _cells_of(points[near]))]  # type: ignore[no-any-return]
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:
@@ -148,12 +150,6 @@ def _cells_of(points: np.ndarray) -> np.ndarray:
 
 def _contains(cells: np.ndarray, of_points: np.ndarray) -> np.ndarray:
     return np.isin(cell_keys(of_points), cell_keys(cells))
-
-
-def _dilated(cells: np.ndarray) -> np.ndarray:
-    """Return the cells with their 26 neighbours."""
-    offsets = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), -1).reshape(-1, 3)
-    return np.unique((cells[:, None] + offsets).reshape(-1, 3), axis=0)
 
 
 def _in_place(points: np.ndarray, T_other: np.ndarray, other: np.ndarray, cells: np.ndarray) -> np.ndarray:

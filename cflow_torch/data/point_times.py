@@ -89,29 +89,26 @@ def seconds_after(
     if times.seconds is None:
         return times
     times = times._replace(is_stray=times.is_stray & ~missing)
-    share, share_besides = _shares_of_stray(values[times.is_stray], (~missing).sum())
-    if share_besides > _MOST_STRAY:
-        return PointTimes(None, nothing, f"{100 * share:.0f} % of the times of points are stray: ignored")
-    return times
-
-
-def _shares_of_stray(values: np.ndarray, num_returns: int) -> tuple[float, float]:
-    """Return the share of the returns that stray values, (S,), make up: of all, and of all but the most frequent one.
-
-    The most frequent one is often that of lost packets.
-    """
-    bits = values.view(f"u{values.dtype.itemsize}")  # comparing signalling NaN warns
+    stray = values[times.is_stray]
+    bits = stray.view(f"u{stray.dtype.itemsize}")  # comparing signalling NaN warns
     _, counts = np.unique(bits, return_counts=True)
-    return len(values) / num_returns, (len(values) - counts.max(initial=0)) / num_returns
+    num_returns = int((~missing).sum())
+    if len(stray) - counts.max(initial=0) > _MOST_STRAY * num_returns:  # the most frequent one is of lost packets
+        share = f"{100 * len(stray) / num_returns:.0f} % of the times of points"
+        return PointTimes(None, nothing, f"{share} are stray: ignored")
+    return times
 
 
 def _converted(values: np.ndarray, is_stray: np.ndarray, stamp_ns: int | None, period: float | None) -> PointTimes:
     """Convert times by their unit and clock, see `seconds_after`. Times far from the median become stray, too."""
     known = values[~is_stray]
     centre = np.partition(known, len(known) // 2)[len(known) // 2]
-    ticks = _differences(values, centre)
+    if values.dtype.kind == "f":
+        ticks = values.astype(np.float64) - float(centre)
+    else:  # counters wrap as in their own type
+        ticks = (values - centre).view(f"i{values.dtype.itemsize}").astype(np.float64)
     half = float(np.subtract(*np.quantile(ticks[~is_stray], (0.75, 0.25))))
-    if _is_share(known):
+    if known.dtype.kind == "f" and 0 <= known.min() <= 0.1 and 0.9 <= known.max() <= 1:
         duration = period if period is not None and period <= _LONGEST_PERIOD else _USUAL_PERIOD
         note = f"times of points go from 0 to 1, so we take them for shares of a sweep of {duration:.3g} s"
         return PointTimes(np.where(is_stray, 0.0, values) * duration, is_stray, note)
@@ -144,18 +141,6 @@ def _is_default(values: np.ndarray) -> np.ndarray:
         return np.zeros(len(values), bool)
     is_default: np.ndarray = values == distinct[counts.argmax()]
     return is_default
-
-
-def _differences(values: np.ndarray, centre: Any) -> np.ndarray:
-    """Return values - centre as (N,) float64. Integers wrap as in their own type."""
-    if values.dtype.kind == "f":
-        return values.astype(np.float64) - float(centre)
-    signed = np.dtype(f"i{values.dtype.itemsize}")
-    return (values - centre).view(signed).astype(np.float64)
-
-
-def _is_share(known: np.ndarray) -> bool:
-    return known.dtype.kind == "f" and 0 <= known.min() <= 0.1 and 0.9 <= known.max() <= 1
 
 
 def _lag(centre: Any, unit: int, stamp_ns: int) -> int:

@@ -42,12 +42,10 @@ def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
         return log
     if reading not in READ_AS:
         raise CFlowError(f"read_as={reading!r}: give one of {', '.join(str(one or 'null') for one in READ_AS)}")
+    placed = _in_world_of_points(log) if reading in ("auto", WORLD) else log
     if reading == "auto":
-        placed = _in_world_of_points(log)
         return ReadAs(placed, WORLD, is_found=True) if _is_in_world(placed) else log
-    if reading == WORLD:
-        log = _in_world_of_points(log)
-    return log if reading is None else ReadAs(log, reading)
+    return log if reading is None else ReadAs(placed, reading)
 
 
 def _in_world_of_points(log: Log) -> Log:
@@ -84,16 +82,6 @@ def begins_late(log: Log) -> bool:
     if len(fourth) != len(columns) or np.ptp(np.quantile(fourth, (0.05, 0.95))) < _LEAST_HEIGHT:
         return False
     return has_ground(np.column_stack([columns[:, 1:], fourth]).astype(np.float32))
-
-
-def _coarse_coordinates(log: Log) -> list[Finding]:
-    """Tell coordinates of a map that are too large for float32."""
-    points = as_numpy(log.sweep(typical_sweeps(log)[0]).points)[:, :3]
-    step = float(np.spacing(np.nanmax(np.abs(points), initial=0).astype(np.float32)))
-    if points.dtype != np.float32 or not step > _COARSEST:
-        return []
-    text = f"the points are float32 with steps of {step:.2g} m, as they are far from the origin of the world"
-    return [Finding("frame", WRONG, f"{text}: give points and poses relative to a place nearby", True)]
 
 
 class ReadAs(LogWrapper):
@@ -134,8 +122,15 @@ class ReadAs(LogWrapper):
         said = Finding("frame", RIGHT, f"as you say, {what} (read_as={self.reading})")
         used = f"we move them to that of the vehicle. data.read_as={self.reading} does the same without this line"
         found = Finding("frame", FOUND, f"{what}, so {used}", True)
-        coarse = [] if self.reading != WORLD else _coarse_coordinates(self.log)
-        return [*self.log.findings(), found if self.is_reading_found else said, *coarse]
+        findings = [*self.log.findings(), found if self.is_reading_found else said]
+        if self.reading == WORLD:  # are coordinates of a map too large for float32?
+            points = as_numpy(self.log.sweep(typical_sweeps(self.log)[0]).points)[:, :3]
+            step = float(np.spacing(np.nanmax(np.abs(points), initial=0).astype(np.float32)))
+            if points.dtype == np.float32 and step > _COARSEST:
+                text = f"the points are float32 with steps of {step:.2g} m"
+                why = "as they are far from the origin of the world: give points and poses relative to a place nearby"
+                findings.append(Finding("frame", WRONG, f"{text}, {why}", True))
+        return findings
 
     @cached_property
     def poses(self) -> np.ndarray | None:

@@ -28,10 +28,6 @@ class Trajectory(NamedTuple):
     source: str
     labels: Sequence[str] = ()  # names of the rows, such as those of the clouds; () = unknown
 
-    def seen_from(self, frame_T_other: np.ndarray) -> Trajectory:
-        """Return the poses of another frame that is fixed in this one."""
-        return self._replace(poses=self.poses @ frame_T_other)
-
     def is_sparse(self, times_ns: Sequence[int]) -> bool:
         """Test whether poses are clearly rarer than sweeps at these times."""
         known: np.ndarray = np.zeros(0) if self.times_ns is None else self.times_ns
@@ -112,7 +108,11 @@ def fit_to_sweeps(trajectory: Trajectory, times_ns: Sequence[int]) -> tuple[np.n
         left, right = (rows[covered][is_between] for rows in (before, after))
         share = (wanted[covered][is_between] - known[left]) / (known[right] - known[left])
         poses[is_between] = interpolate_motion(trajectory.poses[left], trajectory.poses[right], share)
-    notes = [_describe_uncovered(trajectory.source, known, wanted, covered), _describe_rate(known)]
+    notes = [_describe_uncovered(trajectory.source, known, wanted, covered)]
+    usual = _longest_gap(known) / _OF_STEPS
+    if usual > _LONGEST_GAP_NS:
+        fix = "if static points move, try data.odometry=refine"
+        notes.append(f"its poses are {usual * 1e-9:.2g} s apart, and we interpolate: {fix}")
     return poses, covered, "; ".join(filter(None, notes))
 
 
@@ -128,15 +128,6 @@ def _describe_misfit(source: str, known: np.ndarray, wanted: np.ndarray) -> str:
     rate = np.median(np.diff(known)) * 1e-9
     fix = "give more poses, or none and data.odometry=true"
     return f"{source} has a pose every {rate:.3g} s, and we interpolate up to 1.1 s: {fix}; {where}"
-
-
-def _describe_rate(known: np.ndarray) -> str:
-    """Say that poses are far apart; "" = they are not."""
-    usual = _longest_gap(known) / _OF_STEPS
-    if usual <= _LONGEST_GAP_NS:
-        return ""
-    fix = "if static points move, try data.odometry=refine"
-    return f"its poses are {usual * 1e-9:.2g} s apart, and we interpolate: {fix}"
 
 
 def _describe_uncovered(source: str, known: np.ndarray, wanted: np.ndarray, covered: np.ndarray) -> str:

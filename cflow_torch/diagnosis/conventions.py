@@ -62,28 +62,19 @@ class Reading(NamedTuple):
     fix: str = ""  # what corrects it; "" = the value of `read_as` with its name
 
 
-def scaled(unit: float) -> _Convert:
-    return partial(_scale, unit)  # logs that keep it must be picklable
-
-
-def _scale(unit: float, poses: np.ndarray) -> np.ndarray:
+def scale_poses(unit: float, poses: np.ndarray) -> np.ndarray:
     return as_matrix(poses[..., :3, :3], unit * poses[..., :3, 3])
 
 
-def turned(axes: np.ndarray) -> _Convert:
-    """Return what gives poses of a frame with other axes the axes of the points."""
-    T_stored_ego = as_matrix(axes.T)
+def turned(axes: np.ndarray, place: Sequence[float] = (0, 0, 0)) -> _Convert:
+    """Return what gives poses of a frame with other axes, or of another place, those of the points."""
+    T_stored_ego = as_matrix(axes.T, place)
     return lambda poses: poses @ T_stored_ego
 
 
 def _mirrored(axes: np.ndarray) -> _Convert:
     mirror = as_matrix(axes)
     return lambda poses: mirror @ poses @ mirror
-
-
-def _mounted(x: float, y: float) -> _Convert:
-    ego_T_points = as_matrix(np.eye(3), (x, y, 0))
-    return lambda poses: poses @ ego_T_points
 
 
 def _reordered(order: Sequence[int]) -> _Convert:
@@ -94,14 +85,8 @@ def _transposed(axes: np.ndarray) -> _Convert:
     return lambda poses: as_matrix(axes @ poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3])
 
 
-def _still(poses: np.ndarray) -> np.ndarray:
-    return np.tile(np.eye(4), (len(poses), 1, 1))
-
-
 def _unturned(poses: np.ndarray) -> np.ndarray:
-    unturned = _still(poses)
-    unturned[:, :3, 3] = poses[:, :3, 3]
-    return unturned
+    return as_matrix(np.tile(np.eye(3), (len(poses), 1, 1)), poses[:, :3, 3])
 
 
 def _joined(poses: np.ndarray) -> np.ndarray:
@@ -177,7 +162,7 @@ def _mounts() -> dict[str, Reading]:
     for size in (0.7, 1.4, 2.7, 4.0):
         for x, y in ((size, 0), (-size, 0), (0, size), (0, -size)):
             name, opposite = (f"{MOUNT} {sign * x:g} {sign * y:g}" for sign in (1, -1))
-            readings[name] = Reading("", _mounted(x, y), margin=_SMALL, opposite=opposite)
+            readings[name] = Reading("", turned(np.eye(3), (x, y, 0)), margin=_SMALL, opposite=opposite)
     return readings
 
 
@@ -194,7 +179,7 @@ READINGS: dict[str, Reading] = {
     "world_axes": Reading("the points have the axes of the world, but lie around the vehicle", _unturned),
     STILL: Reading(
         "the static world stands still without the poses, so they are of another log, or the points are compensated",
-        _still,
+        lambda poses: np.tile(np.eye(4), (len(poses), 1, 1)),
     ),
     **TIMES_OF_POSES,
     "steps": Reading("the poses are steps (each is that of a sweep in the frame of the sweep before)", _joined),
@@ -226,7 +211,7 @@ READINGS: dict[str, Reading] = {
         "the quaternions of the poses begin with w, but were read with w last", _reordered((1, 2, 3, 0))
     ),
     "w_last": Reading("the quaternions of the poses end with w, but were read with w first", _reordered((3, 0, 1, 2))),
-    **{name: Reading(f"the poses are in {name}", scaled(unit)) for name, unit in UNITS.items()},
+    **{name: Reading(f"the poses are in {name}", partial(scale_poses, unit)) for name, unit in UNITS.items()},
     **{
         f"points_{name}": Reading(f"the points are in {name}", of_points=_of_axes(unit * np.eye(3)))
         for name, unit in UNITS.items()

@@ -15,7 +15,7 @@ from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, judg
 from cflow_torch.diagnosis.stillness import LEAST_SHARE, MISPLACED, are_finite, share_of_sweeps
 from cflow_torch.errors import warn
 from cflow_torch.ground.segmentation import find_ground, has_ground
-from cflow_torch.types import MOVING, Array, FlowResult, Sweep, Window, as_numpy
+from cflow_torch.types import MOVING, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import have_same_points
 
@@ -176,23 +176,20 @@ def inactive_problems(windows: Sequence[Window], results: Sequence[FlowResult], 
     the host waits for the device once.
     """
     is_used = torch.stack([result.is_valid.any() for result in results]).tolist() if results else []
-    return [
-        "" if used or len(window.pc0.points) == 0 else _describe_inactive(window.pc0.points, config)
-        for window, used in zip(windows, is_used)
-    ]
-
-
-def _describe_inactive(points: Array, config: Config) -> str:
-    """Return the message for a pc0 without active points, with the extent of its points."""
-    positions = as_numpy(points)[:, :3]
-    finite = positions[np.isfinite(positions).all(axis=1)]
-    seen = "all are NaN or infinite"
-    if len(finite):
-        low = finite.min(axis=0)
-        high = finite.max(axis=0)
-        extent = ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in zip("xyz", low, high))
-        seen = f"they span {extent} in their own frame"
-    return (
-        f"none of the {len(positions)} points of pc0 is active ({seen}): are they metres, near the ego vehicle, and "
-        f"not all of them ground? point_cloud_range={config.point_cloud_range}, in the ego frame at t+1"
-    )
+    problems = []
+    for window, used in zip(windows, is_used):
+        if used or len(window.pc0.points) == 0:
+            problems.append("")
+            continue
+        positions = as_numpy(window.pc0.points)[:, :3]
+        finite = positions[are_finite(positions)]
+        seen = "all are NaN or infinite"
+        if len(finite):
+            spans = zip("xyz", finite.min(axis=0), finite.max(axis=0))
+            extent = ", ".join(f"{axis} {low:.6g} to {high:.6g}" for axis, low, high in spans)
+            seen = f"they span {extent} in their own frame"
+        problems.append(
+            f"none of the {len(positions)} points of pc0 is active ({seen}): are they metres, near the ego vehicle, "
+            f"and not all of them ground? point_cloud_range={config.point_cloud_range}, in the ego frame at t+1"
+        )
+    return problems

@@ -100,6 +100,15 @@ def _seen_from(ego_T_points: np.ndarray, steps: np.ndarray) -> np.ndarray:
     return np.linalg.inv(ego_T_points) @ steps @ ego_T_points  # type: ignore[no-any-return]
 
 
+def _shares(pairs: Sequence[Pair], scan: str, ego_T_points: np.ndarray, count: int) -> np.ndarray:
+    """Return the sums of the pairs' shares in place under each mounting, (M, 4, 4), by the first `count` points."""
+    shares = np.zeros(len(ego_T_points))
+    for pair in pairs:
+        steps = _seen_from(ego_T_points, pair.transforms[GIVEN])
+        shares += pair.target.structure(scan).shares(pair.source.points(scan)[:count], steps)
+    return shares
+
+
 def place_of(pairs: Sequence[Pair], scan: str, rotation: np.ndarray) -> np.ndarray:
     """Return the place in the frame of the poses, (3,), at which the points' origin fits best, if they are turned.
 
@@ -109,10 +118,7 @@ def place_of(pairs: Sequence[Pair], scan: str, rotation: np.ndarray) -> np.ndarr
     places = np.concatenate([origin, _PLACES])
     for count in (FEW_POINTS, MOST_POINTS, MOST_POINTS):
         ego_T_points = as_matrix(np.tile(rotation, (len(places), 1, 1)), places @ rotation[:, :2].T)
-        shares = np.zeros(len(places))
-        for pair in pairs:
-            steps = _seen_from(ego_T_points, pair.transforms[GIVEN])
-            shares += pair.target.structure(scan).shares(pair.source.points(scan)[:count], steps)
+        shares = _shares(pairs, scan, ego_T_points, count)
         best = places[1:][np.argsort(-shares[1:], kind="stable")]
         places = np.concatenate([origin, best[:_NUM_BEST] if len(best) > _NUM_BEST else best[0] + _BETWEEN])
     is_at_origin = turn_of(rotation) > 0 and shares[0] >= EQUAL * shares[1:].max()
@@ -126,11 +132,7 @@ def mounting_of(pairs: Sequence[Pair], scan: str, rotation: np.ndarray) -> tuple
     """
     near = rotations_about(2, _YAWS) @ rotation
     mounts = [(rotation, np.zeros(3)), *((turned, place_of(pairs, scan, turned)) for turned in near)]
-    ego_T_points = np.stack([as_matrix(*mount) for mount in mounts])
-    shares = np.zeros(len(mounts))
-    for pair in pairs:
-        steps = _seen_from(ego_T_points, pair.transforms[GIVEN])
-        shares += pair.target.structure(scan).shares(pair.source.points(scan)[:MOST_POINTS], steps)
+    shares = _shares(pairs, scan, np.stack([as_matrix(*mount) for mount in mounts]), MOST_POINTS)
     return mounts[0 if shares[0] >= EQUAL * shares.max() else int(shares.argmax())]
 
 

@@ -129,7 +129,9 @@ def make_pair(
     clouds = [_cloud(*each, centre) for each in zip((pc0, pc1), rows_of, deskew)]
     transforms = _transforms(poses if around is None else around, rows) if has_poses else {GIVEN: np.eye(4)}
     if in_world:
-        transforms = {name: _about(centre, T) for name, T in transforms.items()}
+        # For points relative to the centre.
+        about = {name: (T[:3, :3], T[:3, :3] @ centre + T[:3, 3] - centre) for name, T in transforms.items()}
+        transforms = {name: as_matrix(*parts) for name, parts in about.items()}
         transforms[WORLD] = transforms.pop(STILL)
     has_motion = has_poses and (in_world or bool(difference(transforms[GIVEN], np.eye(4)) >= LEAST_MOTION))
     is_sparse = min(len(pc0.points), len(pc1.points)) < _SPARSE
@@ -181,8 +183,3 @@ def difference(T: np.ndarray, other: np.ndarray) -> np.ndarray:
 def _blocks(points: np.ndarray) -> np.ndarray:
     """Return the key of the block of 5 m in the plane that holds each point, (N,) int64."""
     return np.floor(points[:, :2] / _BLOCK).astype(np.int64) @ np.array((1 << 20, 1))  # type: ignore[no-any-return]
-
-
-def _about(centre: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Return a transform for points relative to `centre`."""
-    return as_matrix(T[:3, :3], T[:3, :3] @ centre + T[:3, 3] - centre)

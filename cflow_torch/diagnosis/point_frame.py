@@ -19,7 +19,7 @@ _FAR, _NOT_NEAR = 50.0, 20.0
 _MOST_POINTS = 20_000
 _NEAR = 30.0  # metres
 # Metres of a sensor above the ground: cars have 1.5 to 2, trucks up to 4. In feet, cars have 4.5 to 8.
-_LOWEST_SENSOR, _HIGHEST_SENSOR, _HIGHEST_IN_FEET = 1.1, 4.3, 9.0
+_LOWEST_SENSOR, _HIGHEST_SENSOR, _HIGHEST_ON_CAR = 1.1, 4.3, 2.75
 _FLAT = 0.6  # of a cloud with z up, the extent in z is less than this part of that in x or y
 _TALL = {  # readings of clouds that are flat in y or x, not in z
     "points_camera": "a camera's axes (x right, y down, z forward)",
@@ -49,7 +49,9 @@ def frame_problem(points: Array) -> tuple[str, str]:
     nearest = float(np.quantile(np.hypot(positions[:, 0], positions[:, 1]), 0.05))
     spans = f"nine tenths of the points span {widest:.4g} m"
     if widest >= _LARGEST:
-        unit, why = ("millimetres", "") if widest >= _MILLIMETRES else _small_unit(positions)
+        unit = "millimetres" if widest >= _MILLIMETRES else "centimetres"
+        heights = _heights_if(positions, "centimetres", "inches") if unit == "centimetres" else ""
+        unit, why = ("inches", f" ({heights})") if heights else (unit, "")
         return f"points_{unit}", f"{spans}: they seem to be in {unit}{why}, give points in metres"
     if widest >= _WIDE and _NOT_NEAR <= nearest < widest / 2:
         return "points_decimetres", f"{spans}, few less than {nearest:.0f} m away: they seem to be in decimetres"
@@ -66,9 +68,9 @@ def frame_problem(points: Array) -> tuple[str, str]:
     if side < 0:
         return "points_upside_down", "z seems to point down, because nearly all points lie below the ground: " + _UP
     is_tall = extent[2] > _FLAT * max(extent[0], extent[1]) and min(extent[:2]) < _FLAT * extent[2]
-    in_feet = _in_feet(positions) if side > 0 and low[2] < -_HIGHEST_SENSOR else ""
-    if in_feet:
-        return "points_feet", in_feet
+    heights = _heights_if(positions, "metres", "feet") if side > 0 and low[2] < -_HIGHEST_SENSOR else ""
+    if heights:
+        return "points_feet", f"{heights}: give points in metres"
     for reading, axes in _TALL.items() if is_tall and side == 0 else ():
         if _has_ground_as(reading, positions):
             return reading, f"the points seem to have {axes}: {_UP}"
@@ -111,28 +113,17 @@ def _sampled(points: Array) -> np.ndarray:
     return positions[np.isfinite(positions).all(axis=1)]  # type: ignore[no-any-return]
 
 
-def _in_feet(positions: np.ndarray) -> str:
-    """Return what is wrong if the sensor is as high above the ground, in feet, as on a vehicle; "" otherwise."""
-    height = -_height_of_ground(positions)
-    if not _HIGHEST_SENSOR < height < _HIGHEST_IN_FEET:
-        return ""
-    lower = f"{UNITS['feet'] * height:.1f} m if the points are in feet"
-    return f"the ground lies {height:.1f} m below the sensor, or {lower}: give points in metres"
+def _heights_if(positions: np.ndarray, unit: str, other: str) -> str:
+    """Return how high the sensor is above the ground in two units if only the other one is usual; "" = else."""
+    ground = _near_ground(UNITS.get(unit, 1.0) * positions)
+    height = -float(np.median(ground[:, 2])) if len(ground) else 0.0
+    changed = UNITS[other] / UNITS.get(unit, 1.0) * height
+    is_usual = _LOWEST_SENSOR < height < _HIGHEST_SENSOR or not _LOWEST_SENSOR < changed < _HIGHEST_ON_CAR
+    return "" if is_usual else f"the sensor is {height:.1f} m above the ground in {unit}, {changed:.1f} m in {other}"
 
 
-def _small_unit(positions: np.ndarray) -> tuple[str, str]:
-    """Return "centimetres" or "inches", by which the sensor is as high above the ground as on a vehicle, and why."""
-    height = -_height_of_ground(UNITS["centimetres"] * positions)
-    in_inches = UNITS["inches"] / UNITS["centimetres"] * height
-    if not height < _LOWEST_SENSOR < in_inches:
-        return "centimetres", ""
-    return "inches", f" (the sensor is then {in_inches:.1f} m above the ground, in centimetres {height:.1f} m)"
-
-
-def _height_of_ground(positions: np.ndarray) -> float:
-    """Return the median height of the ground near the sensor, 0 if there is none."""
-    heights = positions[find_ground(positions, "grid") & (np.hypot(*positions[:, :2].T) < _NEAR), 2]
-    return float(np.median(heights)) if len(heights) else 0.0
+def _near_ground(positions: np.ndarray) -> np.ndarray:
+    return positions[find_ground(positions, "grid") & (np.hypot(*positions[:, :2].T) < _NEAR)]  # type: ignore[no-any-return]
 
 
 def _is_spherical(positions: np.ndarray) -> bool:
@@ -159,19 +150,13 @@ def _tilt_of(positions: np.ndarray) -> np.ndarray | None:
         turned = positions @ rotations_about(axis, np.radians(turn)).T
         if turn and not has_ground(turned):
             continue
-        slopes = _slopes_of_ground(turned)
-        if slopes is not None:
-            return np.array(((axis == 0) * turn - slopes[1], (axis == 1) * turn + slopes[0]))
+        ground = _near_ground(turned)
+        if len(ground) < _FEWEST:
+            continue
+        plane, *_ = np.linalg.lstsq(np.column_stack([ground[:, :2], np.ones(len(ground))]), ground[:, 2], rcond=None)
+        along_x, along_y = np.degrees(np.arctan(plane[:2]))
+        return np.array(((axis == 0) * turn - along_y, (axis == 1) * turn + along_x))
     return None
-
-
-def _slopes_of_ground(positions: np.ndarray) -> np.ndarray | None:
-    """Return the slopes of the plane of the ground near the sensor along x and y, degrees; None = too little of it."""
-    ground = positions[find_ground(positions, "grid") & (np.hypot(*positions[:, :2].T) < _NEAR)]
-    if len(ground) < _FEWEST:
-        return None
-    plane, *_ = np.linalg.lstsq(np.column_stack([ground[:, :2], np.ones(len(ground))]), ground[:, 2], rcond=None)
-    return np.degrees(np.arctan(plane[:2]))  # type: ignore[no-any-return]
 
 
 _UP = "give points with z up"

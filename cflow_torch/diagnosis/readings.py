@@ -8,6 +8,7 @@ the structure that is in place. (4) Name the reading that is clearly best, unles
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -26,7 +27,7 @@ from cflow_torch.diagnosis.conventions import (
     UNITS,
     WORLD,
     Reading,
-    scaled,
+    scale_poses,
 )
 from cflow_torch.diagnosis.other_frame import find_motion, motion_of, mounting, mounting_of, place_of, rotation_between
 from cflow_torch.diagnosis.pair import COMPARED, GIVEN, LEAST_MOTION, MOST_POINTS, Pair, difference
@@ -96,16 +97,13 @@ class Judgement:
         """
         return not self.best and self.given < LEAST_SHARE and not self.is_peak
 
-    @property
-    def is_small(self) -> bool:
-        """Whether a small mistake is named."""
-        return any(map(_is_small, self.best))
-
     def confirmed_by(self, again: Judgement) -> Judgement:
         """Return the judgement without small mistakes that other pairs do not show.
 
         Noise may fit one of them by chance, and poses are then inaccurate.
         """
+        if not self.best or not again.shares:
+            return self
         others = {name.partition(" ")[0] for name in again.best}  # any mounting confirms one
         names = [
             name
@@ -290,7 +288,7 @@ def _readings_of_motions(pairs: Sequence[Pair], scan: str, motions: Sequence[np.
     if scale > _RESCALED or 1e-9 < scale < 1 / _RESCALED:
         found[SCALED] = Reading(
             f"the positions of the poses are {1 / scale:.3g} times as long as the motion of the points",
-            scaled(scale),
+            partial(scale_poses, scale),  # picklable
             fix=f"positions multiplied by {scale:.3g}, unless the points have another unit (feet)",
         )
     return found

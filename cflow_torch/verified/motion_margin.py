@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import constant, divide, flat_nonzero
+from cflow_torch.ops.indices import constant, flat_nonzero
 from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.columns import Pixels
 from cflow_torch.verified.comparisons import count_in_place
@@ -113,33 +113,13 @@ def _test_with_copies(sweeps: HeightSlicedSweeps, pixels: Pixels, of_object: Gro
     """Return how many slices of K pixels the motion of each object wins and loses, near counts, (G, 1 + 4) each.
 
     After its own motion come four copies of it, displaced along x and along y.
+
+    Convention: rotations are ignored: all pixels of an object move as its centre does.
     """
     off = _DISPLACEMENT / sweeps.grid.pixel_size
     offsets = constant(((0, 0), (off, 0), (-off, 0), (0, off), (0, -off)), torch.float64, pixels.slices.device)
-    by_motion, motion = _group_by_motion(sweeps, pixels, of_object.of_item, rigid)
-    near = count_wins(sweeps, pixels, by_motion, motion[:, None] + offsets).near
-    of_group = Groups(by_motion.max(of_object.of_item, empty=0), of_object.count)
-    return Counts(of_group.sum(near.won.t()).t(), of_group.sum(near.lost.t()).t())
-
-
-def _group_by_motion(
-    sweeps: HeightSlicedSweeps, pixels: Pixels, which: Tensor, rigid: RigidMotion
-) -> tuple[Groups, Tensor]:
-    """Group K pixels that move alike; `which` is the object of each one, (K,) int64.
-
-    The pixels of an object are a group, except those that its rotation displaces by a pixel or more. Each of these is a
-    group of its own, after the G objects. The second result is the motion of each group, (number of groups, 2) float64,
-    (y, x), finest pixels per sweep interval.
-    """
     motion = rigid.pixels_per_interval(sweeps.grid.pixel_size)  # [G, 2]
-    position = sweeps.grid.centre(pixels.row_col).flip(0)  # [2, K], x and y
-    at_t = position + rigid.flow.index_select(0, which).t() * (sweeps.elapsed_of(pixels) - 1)
-    local_motion = divide(rigid.flow_at(which, at_t).flip(1), sweeps.grid.pixel_size)  # [K, 2]
-    rotation = local_motion - motion.index_select(0, which)
-    alone = flat_nonzero((rotation.abs() >= 1).any(1))
-    group = which.index_copy(0, alone, torch.arange(len(alone), device=which.device) + len(motion))
-    motion = torch.cat((motion, local_motion.index_select(0, alone)))
-    return Groups(group, len(motion)), motion
+    return count_wins(sweeps, pixels, of_object, motion[:, None] + offsets).near
 
 
 def _are_lines(sweeps: HeightSlicedSweeps, pixels: Pixels, of_object: Groups) -> Tensor:

@@ -37,7 +37,8 @@ class Shifts:
         to_newest = sweeps.elapsed.index_select(0, window)  # [M, S]
         elapsed = torch.stack((to_newest, -to_newest))  # [2, M, S], from each sweep to t+1, and from t+1 to each sweep
         displacement = motions[:, None] * elapsed[..., None, None]  # [2, M, S, C, 2]
-        pair = (displacement + 0.5).floor().int().view(torch.int64)[..., 0]  # [2, M, S, C], y and x as one number
+        shift = (displacement + 0.5).floor().int().contiguous()
+        pair = shift.view(torch.int64)[..., 0]  # [2, M, S, C], y and x as one number
         num_motions = motions.shape[1]
         self._number: Tensor | None = None  # motion c has shift c
         if num_motions > 1 and pair.device.type == "cpu":

@@ -12,7 +12,7 @@ import numpy as np
 import cflow_torch
 from oracle.aperture import principal_axis
 from oracle.height_slices import COUNT, SlicedSweeps, over_squares, value_at
-from oracle.paired_test import are_wide, count_wins, found_in_place
+from oracle.paired_test import count_wins, found_in_place
 from oracle.registration import RigidMotion
 
 FILE = Path(cflow_torch.__file__).parent / "verified" / "confidence.json"
@@ -36,11 +36,9 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
         return 0, False
     speed, off = math.hypot(*rigid.flow), DISPLACEMENT / sweeps.size
     is_fast, is_far = speed >= TABLE["fast"], np.square(rigid.centre).sum() >= TABLE["far"] ** 2
-    motion = motion_of_pixels(sweeps, members, rigid)
-    is_alone, is_wide = (motion != np.array(rigid.flow)[::-1] / sweeps.size).any(1), are_wide(sweeps, members)
-    is_wide = np.where(is_alone, is_wide, is_wide[~is_alone].any())
+    motion = np.array(rigid.flow)[::-1] / sweeps.size
     (won, lost), *copies = (
-        np.sum(count_wins(sweeps, members, motion + shift, True, is_wide), 1)
+        np.sum(count_wins(sweeps, members, motion + shift, True), 1)
         for shift in ((0, 0), (off, 0), (-off, 0), (0, off), (0, -off))
     )
     noise = math.sqrt(max(won + lost, 1))
@@ -56,16 +54,6 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
     first = len(TABLE["moving"]) - 8 * (1 + len(TABLE["margin"]))
     least = (0.04 if is_fast else 0.02) if sweeps.has_history else (0.15 if is_fast else 0.05)
     return int(number), bool(speed >= 0.05 and TABLE["moving"][first + number] >= least)
-
-
-def motion_of_pixels(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> np.ndarray:
-    """(K, 2): (y, x) pixels per interval, of the pixels of an object: that of the centre, if the rotation adds less
-    than a pixel in y and in x."""
-    pixels, flow = sweeps.pixels[members], np.array(rigid.flow)
-    since_t = (sweeps.elapsed[1] - sweeps.elapsed[pixels[:, 0]])[:, None]
-    own = rigid.flow_at(sweeps.middle(pixels) - flow * since_t) / sweeps.size
-    rotates = (np.abs(own - flow / sweeps.size) >= 1).any(1, keepdims=True)
-    return np.where(rotates, own, flow / sweeps.size)[:, ::-1]
 
 
 def biases(sweeps: SlicedSweeps) -> np.ndarray:

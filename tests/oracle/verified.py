@@ -57,7 +57,8 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
     tree = grow(sweeps, change, config)
     tree.nodes.extend(link_unlinked(sweeps, change[2], tree))
     candidates, scores = propose(sweeps, tree.nodes)
-    proven = [verify(sweeps, *given, len(tree.levels)) for given in zip(tree.nodes, candidates)]
+    parents = [tree.nodes[node.parent] if node.parent >= 0 else None for node in tree.nodes]
+    proven = [verify(sweeps, *given, len(tree.levels)) for given in zip(tree.nodes, parents, candidates)]
     nodes = add_unchanged(sweeps, tree.nodes, [motion for motion, _ in proven], len(tree.levels))
     motions = [motion for motion, _ in proven]
     evidence = [value for _, value in proven]
@@ -94,19 +95,24 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
     return PointMotion([flow], ids, score, confidence, moving)
 
 
-def verify(sweeps: SlicedSweeps, node: Node, candidates: Sequence[Vector], num_levels: int) -> tuple[Vector, int]:
+def verify(
+    sweeps: SlicedSweeps, node: Node, parent: Node | None, candidates: Sequence[Vector], num_levels: int
+) -> tuple[Vector, int]:
     """The candidate of most evidence, and its evidence: that of the counts and, with twice as many standard deviations,
     that of the near counts. Fast objects need twice as many of both counts, nodes of changed pixels twice as many of
-    each. With history, all must gain a slice for eight pixels."""
+    each. With history, all must gain a slice for eight pixels. If there is a parent, the last candidate but one is its
+    first one, and must not slide along the parent, either."""
     z = sweeps.config.significance * (CHANGED_Z if node.level == num_levels else 1)
     is_fast = node.level > num_levels
     least = 16 * len(node.members) / 8 * sweeps.has_history
     evidence = []
-    for motion in candidates:
+    for number, motion in enumerate(candidates):
+        lines = [node, parent] if parent is not None and number == len(candidates) - 2 else [node]
         exact, near = (count_wins(sweeps, node.members, motion, is_near).sum(1).tolist() for is_near in (False, True))
         own = evidence_of(*exact, 2 * z if is_fast else z) + evidence_of(*near, 2 * z)
         stays = is_fast and LEAVES * exact[1] > exact[0]
-        counts = own > least and not stays and not slides_along_itself(sweeps, node.members, motion)
+        slides = any(slides_along_itself(sweeps, line.members, motion) for line in lines)
+        counts = own > least and not stays and not slides
         evidence.append(own if counts else 0)
     best = evidence.index(max(evidence))  # ties: the first
     return (candidates[best] if evidence[best] > 0 else (0.0, 0.0)), evidence[best]

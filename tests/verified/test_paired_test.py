@@ -107,6 +107,25 @@ def test_nodes_of_changed_pixels_need_twice_as_many_standard_deviations(level, n
     assert motion.tolist() == [[0.0, 5.0 * moves]]
 
 
+@pytest.mark.parametrize("of_parent, moves", [(True, False), (False, True)])
+def test_a_part_of_a_rail_does_not_move_as_the_rail_seems_to(of_parent, moves):
+    """Beams hit every eighth pixel of a rail. A third of it is too short for a rail."""
+    images = np.zeros((1, 2, 8, 100), dtype=np.uint8)
+    images[0, 1, 2, 2:90:8] = images[0, 0, 2, 7:95:8] = 1
+    sweeps = from_images(images)
+    every = torch.arange(sweeps.num_pixels)
+    part = every[sweeps.pixels.row_col[1] < 28]
+    members = Groups(torch.cat((torch.zeros_like(every), torch.ones_like(part))), 2)
+    zero = torch.zeros(2, dtype=torch.int64)
+    tree = Tree(
+        torch.cat((every, part)), members, Groups(torch.tensor([2, 0]), 2), zero, zero, torch.zeros(2, 2), num_levels=2
+    )
+    motions = torch.zeros(2, 2, 2, dtype=torch.float64)
+    motions[0, 0, 1] = motions[1, int(of_parent), 1] = 5.0
+    motion, _ = fast.verify(sweeps, tree, motions, 1.5)
+    assert motion.tolist() == [[0.0, 0.0], [0.0, 5.0 * moves]]
+
+
 Pixels = Set[Tuple[int, int]]
 
 

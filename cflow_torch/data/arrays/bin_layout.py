@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from cflow_torch.types import CFlowError
 
 KITTI_COLUMNS = 4  # x, y, z, reflectance
-_COLUMNS = (4, 3, 5, 6, 7, 8)
+_COLUMNS = range(3, 9)
 _SMALLEST, _LARGEST = 1e-6, 1e7  # sizes that coordinates, intensities, rings and times have, besides 0
 _SHARE = 0.95  # of the numbers have such a size; of numbers read in a wrong type, less than 0.8
 _EXPLAINED, _AS_GOOD = 0.05, 0.9  # least share of the variance, and the share of the best that a smaller number needs
@@ -71,24 +72,23 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
         if not kind:
             raise CFlowError(f"x, y, z of {columns} numbers per point are no coordinates in float32 or float64: {_FIX}")
         return BinLayout(columns, kind)
-    fitting = [BinLayout(count, kind) for count in _COLUMNS if kind]
-    fitting = [layout for layout in fitting if len(content) % layout.step == 0]
-    explained = [_explained(_numbers(content, layout.kind), layout.columns) for layout in fitting]
-    best = max(explained, default=0.0)
-    good = [layout for layout, share in zip(fitting, explained) if share >= max(_AS_GOOD * best, _EXPLAINED)]
-    if good:
-        return min(good, key=lambda layout: layout.columns)
-    if fitting and len(content) < _FEWEST * BinLayout().step and fitting[0] == BinLayout():
-        return BinLayout()
-    records = (BinLayout(3, "<f4", rest) for rest in range(1, _LONGEST_RECORD - 11) if not kind)
-    record = next((layout for layout in records if _are_records(content, layout)), None)
-    if record is not None:
-        return record
-    counts = ", ".join(map(str, sorted(_COLUMNS)))
-    raise CFlowError(
-        f"it has {len(content)} bytes, and does not look like points of {counts} float32 or float64 numbers, x, y, z "
-        f"first, or records that begin with these: {_FIX}"
-    )
+    layouts = [BinLayout(count, kind) for count in _COLUMNS if kind]
+    fitting = [layout for layout in layouts if len(content) % layout.step == 0]
+    explained = {layout: _explained(_numbers(content, layout.kind), layout.columns) for layout in fitting}
+    least = max(_AS_GOOD * max(explained.values(), default=0.0), _EXPLAINED)
+    good = [layout for layout in fitting if explained[layout] >= least]
+    if not good and len(content) < _FEWEST * BinLayout().step and BinLayout() in fitting:
+        good = [BinLayout()]
+    if not kind:
+        records = (BinLayout(3, "<f4", rest) for rest in range(1, _LONGEST_RECORD - 11))
+        good = list(islice((layout for layout in records if _are_records(content, layout)), 1))
+    if not good:
+        counts = ", ".join(map(str, _COLUMNS))
+        raise CFlowError(
+            f"it has {len(content)} bytes, and does not look like points of {counts} float32 or float64 numbers, x, y, "
+            f"z first, or records that begin with these: {_FIX}"
+        )
+    return min(good)  # of the fewest columns
 
 
 def _are_records(content: bytes, layout: BinLayout) -> bool:

@@ -33,6 +33,11 @@ TABLES: dict[str, Any] = {  # suffix -> function that reads, and one that writes
     ".feather": (feather.read_table, feather.write_feather),
     ".parquet": (parquet.read_table, parquet.write_table),
 }
+_WIDER: dict[str, dict[Any, Any]] = {  # suffix -> types that the format lacks, and those that we write
+    ".pcd": {np.bool_: np.uint8, np.float16: np.float32},
+    ".ply": {np.bool_: np.uint8, np.float16: np.float32, np.int64: np.float64, np.uint64: np.float64},
+    ".parquet": {np.float16: np.float32},
+}
 _CLOUD_KEYS = ("points", "lidar", "xyz", "pc")  # of an .npz file with more than one table
 
 
@@ -72,7 +77,12 @@ def read_table(path: PathLike, bin_columns: int | BinLayout | None = None) -> tu
         points = np.stack(_positions(fields), axis=1)
         check_array(points, "its cloud", (None, 3), "fiu", "(N,) numbers each for x, y and z, metres")
     precision = np.float64 if np.result_type(points, np.float32) == np.float64 else np.float32
-    return points.astype(precision, copy=False), _other_columns(fields)
+    others = {}
+    for name, values in fields.items():
+        kind = values.dtype
+        if name.lower() not in AXES and values.shape == (len(points),) and kind.kind in "biuf" and kind.itemsize <= 8:
+            others[name] = values.astype(kind.newbyteorder("="), copy=False)
+    return points.astype(precision, copy=False), others
 
 
 def read_columns(path: PathLike, bin_columns: int | BinLayout | None = None) -> dict[str, np.ndarray]:
@@ -82,16 +92,6 @@ def read_columns(path: PathLike, bin_columns: int | BinLayout | None = None) -> 
     and columns of several numbers per point.
     """
     return read_table(path, bin_columns)[1]
-
-
-def _other_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    shape = _positions(fields)[0].shape
-    kept = {}
-    for name, values in fields.items():
-        kind = values.dtype
-        if name.lower() not in AXES and values.shape == shape and kind.kind in "biuf" and kind.itemsize <= 8:
-            kept[name] = values.astype(kind.newbyteorder("="), copy=False)
-    return kept
 
 
 def in_single(points: np.ndarray) -> np.ndarray:
@@ -134,7 +134,7 @@ def write_cloud(
     fields = {}
     for name, values in (*zip(AXES, points.T), *named.items()):
         allowed = re.sub("[^!-~]", "_", name) if suffix in (".pcd", ".ply") else name
-        fields[allowed] = _storable(values, suffix)
+        fields[allowed] = np.ascontiguousarray(values, _WIDER.get(suffix, {}).get(values.dtype.type, values.dtype))
     if [*AXES, *named] == default_names(3 + len(named)):
         points, named = np.column_stack([points, *named.values()]), {}
     with atomic_file(path) as file:
@@ -215,18 +215,6 @@ def _checked_suffix(path: Path, suffix: str, allowed: Sequence[str] = SUFFIXES) 
 
 def _hint(path: Path) -> str:
     return "pass plain arrays, not pickled objects" if path.suffix.lower() in (".npy", ".npz") else "copy it again"
-
-
-def _storable(values: np.ndarray, suffix: str) -> np.ndarray:
-    """Return the values in a type that the format has."""
-    kind: Any = values.dtype
-    if suffix in (".pcd", ".ply") and kind == np.bool_:
-        kind = np.uint8
-    elif suffix in (".pcd", ".ply", ".parquet") and kind == np.float16:
-        kind = np.float32
-    elif suffix == ".ply" and kind in (np.int64, np.uint64):
-        kind = np.float64
-    return np.ascontiguousarray(values, kind)
 
 
 def _positions(fields: Mapping[str, np.ndarray]) -> list[np.ndarray]:

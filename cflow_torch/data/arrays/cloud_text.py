@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from decimal import Decimal
+from typing import Any, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -60,3 +62,27 @@ def text_columns(content: bytes) -> dict[str, np.ndarray]:
 def with_plain_nan(content: bytes) -> bytes:
     """Return a text in which NaN and infinity are nan where programs on Windows write -nan(ind) or 1.#QNAN."""
     return _NO_NUMBER.sub(b"nan", content)
+
+
+def numbers_of(words: Sequence[bytes], kind: np.dtype[Any]) -> np.ndarray:
+    """Return the numbers in words, exactly. A word that is not a number is a ValueError.
+
+    A number that the type does not have is an OverflowError that names it.
+    """
+    texts = np.array(words, np.bytes_)
+    if kind.kind == "f":
+        with np.errstate(over="ignore"):  # beyond float32, a number is infinite
+            return texts.astype(kind)
+    limits = np.iinfo(kind)
+    try:
+        numbers = texts.astype(np.int64)
+        is_whole = (numbers >= limits.min) & (numbers <= limits.max)
+    except (ValueError, OverflowError):  # 7.000000, or more than 63 bits
+        try:
+            numbers = np.array([Decimal(word.decode()) for word in words], object)
+        except ArithmeticError as error:
+            raise ValueError(f"a word of it is not a number of {kind.name}") from error
+        is_whole = np.array([n.is_finite() and limits.min <= n <= limits.max and n == int(n) for n in numbers])
+    if not is_whole.all():
+        raise OverflowError(f"it has {words[int(is_whole.argmin())].decode()}, which is not a number of {kind.name}")
+    return numbers.astype(kind)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections import Counter
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, Callable, Container, Dict, List, Mapping, Sequence
@@ -87,7 +87,9 @@ def _places(folder: Path) -> list[tuple[Path, _Kinds]]:
         return passed_over
     is_log = any(path.name in (*POSE_FILES, "times.txt") for path in _tables(folder))
     if is_log or (len(below) == 1 and (own or find_pose_files(folder) or find_times_files(folder))):
-        return [*sorted(below.items(), key=lambda place: -_bytes_of(place[1])), *passed_over]
+        clouds = {path: sorted(next(iter(kinds.values()))) for path, kinds in below.items()}
+        size = {path: files[len(files) // 2].stat().st_size for path, files in clouds.items()}
+        return [*sorted(below.items(), key=lambda place: -size[place[0]]), *passed_over]
     return passed_over
 
 
@@ -95,12 +97,6 @@ def _larger(folder: Path, fewest: int) -> _Kinds:
     """Return the kinds of clouds in a folder that have more files, and are no results of ours."""
     kinds = {kind: files for kind, files in _kinds(folder).items() if len(files) > fewest}
     return {} if kinds and record_in(visible(folder)) else kinds
-
-
-def _bytes_of(kinds: _Kinds) -> int:
-    """Return the size of a cloud in the middle."""
-    files = sorted(next(iter(kinds.values())))
-    return files[len(files) // 2].stat().st_size
 
 
 def other_folders(folder: Path) -> list[str]:
@@ -114,12 +110,15 @@ def _kinds(folder: Path) -> _Kinds:
     Texts count if there are no other clouds, if several have names of one pattern, and if the first one is a cloud.
     """
     files = [path for path in visible(folder) if stem_of(path).lower() not in _OTHER_STEMS]
-    kinds = _alike([path for path in files if suffix_of(path) in SUFFIXES])
-    kinds = {kind: same for kind, same in kinds.items() if not _have_no_points(same)}
-    texts = [path for path in files if suffix_of(path) in cloud_text.SUFFIXES]
-    counts = Counter(map(_pattern, texts))
-    texts = [] if kinds else [path for path in texts if counts[_pattern(path)] > 1]
-    return kinds or {kind: same for kind, same in _alike(texts).items() if _is_text_cloud(min(same))}
+    texts = _grouped([path for path in files if suffix_of(path) in cloud_text.SUFFIXES], _pattern)
+    for candidates in (
+        [path for path in files if suffix_of(path) in SUFFIXES],
+        [path for same in texts.values() for path in same if len(same) > 1],
+    ):
+        kinds = {kind: same for kind, same in _alike(candidates).items() if _hold_points(same)}
+        if kinds:
+            return kinds
+    return {}
 
 
 def _alike(files: Sequence[Path]) -> _Kinds:
@@ -153,29 +152,29 @@ def _pattern(path: Path) -> str:
     return _COUNTERS.sub("*", stem_of(path)) + suffix_of(path)
 
 
-def _have_no_points(files: Sequence[Path]) -> bool:
-    """Test whether files have no points, by the first one whose array is not empty, see `_has_no_points`."""
-    answers = map(_has_no_points, islice(sorted(files), _MOST))
-    return next((answer for answer in answers if answer is not None), False)
+def _hold_points(files: Sequence[Path]) -> bool:
+    """Test whether files may be clouds, by the first one that tells it."""
+    answers = map(_holds_points, islice(sorted(files), _MOST))
+    return next((answer for answer in answers if answer is not None), True)
 
 
-def _has_no_points(path: Path) -> bool | None:
-    """Test whether a file has no points, by the shape of an array (labels, masks, images) or its names (poses).
+def _holds_points(path: Path) -> bool | None:
+    """Test whether a file may be a cloud, by the shape of an array, the names of a table, or the lines of a text.
 
-    None = its array is empty, so it may be either.
+    Others are labels, masks, images or poses. None = its array is empty, so it may be either.
     """
+    if suffix_of(path) in cloud_text.SUFFIXES:
+        return _is_text_cloud(path)
     if path.suffix.lower() in TABLES:
-        return are_of_poses(names_in_table(path))
+        return not are_of_poses(names_in_table(path))
     if path.suffix.lower() != ".npy":
-        return False
-    try:
-        with file_errors(path):
-            file = io.BytesIO(read_start(path, _TESTED))
-            np.lib.format.read_magic(file)
-            shape, _, kind = np.lib.format.read_array_header_1_0(file)
-    except CFlowError:
-        return False
-    return None if 0 in shape else kind.kind in "biuf" and not may_be_cloud(shape)
+        return True
+    with suppress(CFlowError), file_errors(path):
+        file = io.BytesIO(read_start(path, _TESTED))
+        np.lib.format.read_magic(file)
+        shape, _, kind = np.lib.format.read_array_header_1_0(file)
+        return None if 0 in shape else kind.kind not in "biuf" or may_be_cloud(shape)
+    return True
 
 
 def _is_text_cloud(path: Path) -> bool:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import io
 import re
-from decimal import Decimal
 from typing import Any, Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.data.arrays.cloud_text import with_plain_nan
+from cflow_torch.data.arrays.cloud_text import numbers_of, with_plain_nan
 from cflow_torch.data.column_names import AXES, distinct_names
 from cflow_torch.errors import import_optional, warn
 
@@ -44,93 +43,50 @@ def _check_number(count: int, header: Mapping[str, Sequence[str]]) -> None:
 
 
 def _text_fields(body: bytes, header: Mapping[str, Sequence[str]]) -> dict[str, np.ndarray]:
-    """Read the fields of a text. Those that are characters, or numbers of another type, are left out, and we say so."""
-    names, counts = header["FIELDS"], [int(count) for count in header["COUNT"]]
-    columns, needed = _columns(header), _needed(names)
-    rows, num_certain = _rows(body, header)
+    """Read the fields of a text. Those that are characters, or numbers of another type, are left out, and we say so.
+
+    PCL writes fields of one byte as characters, of which some are blanks or ends of lines. A row then has fewer words,
+    and only the fields before the first such field are certain. It must be behind x, y, z: else a row of too few words
+    is an error.
+    """
+    names = header["FIELDS"]
+    ends = np.cumsum([int(count) for count in header["COUNT"]]).tolist()  # columns up to each field
+    needed = [k for k, name in enumerate(names) if name.lower() in AXES] or list(range(len(names)))
+    are_bytes = [size == "1" and name != "_" for size, name in zip(header["SIZE"], names)]
+    num_certain = [*are_bytes, True].index(True)
+    num_certain = num_certain if num_certain > max(needed) else len(names)
+    lines = [line.split() for line in with_plain_nan(body).splitlines() if not line.lstrip().startswith(b"#")]
+    rows = [words for words in lines if len(words) >= ends[num_certain - 1]]
+    if num_certain == len(names) and len(rows) < sum(map(bool, lines)):
+        raise ValueError(f"a line of it has fewer than {ends[-1]} numbers")
+    _check_number(len(rows), header)
+    are_short = [len(words) < ends[-1] for words in rows]
+    if are_short[-1:] == [True] and sum(are_short) == 1:
+        raise ValueError("its last line is not complete")
+    num_certain = num_certain if any(are_short) else len(names)
     fields, characters = {}, []
     for k, name in enumerate(names):
-        if counts[k] > 1 or name == "_":
-            continue
-        if k >= num_certain:
-            characters.append(name)
+        if name == "_" or int(header["COUNT"][k]) > 1:
             continue
         kind = np.dtype(f"{header['TYPE'][k].lower()}{header['SIZE'][k]}")
         try:
-            fields[name] = _numbers([words[columns[k]] for words in rows], kind)
+            numbers = None if k >= num_certain else numbers_of([words[ends[k] - 1] for words in rows], kind)
         except OverflowError:
             if k in needed:
                 raise
             warn(f"the field {name} of .pcd files has numbers that are not {kind.name}, so we leave it out")
+            continue
         except ValueError:
             if k in needed or kind.itemsize > 1:
                 raise
+            numbers = None
+        if numbers is None:
             characters.append(name)
+        else:
+            fields[name] = numbers
     if characters:
         warn(f"the fields {', '.join(characters)} of .pcd files hold characters, or follow them, so we leave them out")
     return fields
-
-
-def _rows(body: bytes, header: Mapping[str, Sequence[str]]) -> tuple[list[list[bytes]], int]:
-    """Return the words of the points of a text, and the number of fields, from the first, that are certain in all rows.
-
-    PCL writes fields of one byte as characters, of which some are blanks or ends of lines. Then a row has fewer words,
-    and only the fields before are certain. So the first field of one byte must be behind x, y, z: otherwise, a row of
-    too few words is an error.
-    """
-    names, columns = header["FIELDS"], _columns(header)
-    are_bytes = [size == "1" and name != "_" for size, name in zip(header["SIZE"], names)]
-    uncertain = [*are_bytes, True].index(True)  # the first field that may be a blank; others follow
-    if uncertain <= max(_needed(names)):
-        uncertain = len(names)
-    lines = [line.split() for line in with_plain_nan(body).splitlines() if not line.lstrip().startswith(b"#")]
-    rows = [words for words in lines if len(words) >= columns[uncertain]]
-    if uncertain == len(names) and len(rows) < sum(map(bool, lines)):
-        raise ValueError(f"a line of it has fewer than {columns[-1]} numbers")
-    _check_number(len(rows), header)
-    are_short = [len(words) < columns[-1] for words in rows]
-    if are_short[-1:] == [True] and sum(are_short) == 1:
-        raise ValueError("its last line is not complete")
-    return rows, uncertain if any(are_short) else len(names)
-
-
-def _columns(header: Mapping[str, Sequence[str]]) -> list[int]:
-    """Return the column of the first value of each field, and the number of columns."""
-    return np.cumsum([0, *map(int, header["COUNT"])]).tolist()  # type: ignore[no-any-return]
-
-
-def _needed(names: Sequence[str]) -> list[int]:
-    """Return which fields must be readable: x, y, z, or all if there are none."""
-    return [k for k, name in enumerate(names) if name.lower() in AXES] or list(range(len(names)))
-
-
-def _numbers(words: Sequence[bytes], kind: np.dtype[Any]) -> np.ndarray:
-    """Return the numbers in words. A word that is not a number is a ValueError.
-
-    A number that the type does not have is an OverflowError that names it.
-    """
-    texts = np.array(words, np.bytes_)
-    if kind.kind == "f":
-        return texts.astype(kind)
-    try:
-        numbers = texts.astype(np.int64)
-    except (ValueError, OverflowError):  # 7.000000, or more than 63 bits
-        numbers = np.array([_integer(word, kind) for word in words], object)
-    limits = np.iinfo(kind)
-    is_outside = (numbers < limits.min) | (numbers > limits.max)
-    if is_outside.any():
-        raise OverflowError(f"it has {words[int(is_outside.argmax())].decode()}, which is not a number of {kind.name}")
-    return numbers.astype(kind)
-
-
-def _integer(word: bytes, kind: np.dtype[Any]) -> int:
-    try:
-        number = Decimal(word.decode())
-    except ArithmeticError as error:
-        raise ValueError(f"it has {word!r}, which is not a number") from error
-    if not number.is_finite() or abs(number) > 2**64 or number != number.to_integral_value():
-        raise OverflowError(f"it has {word.decode()}, which is not a number of {kind.name}")
-    return int(number)
 
 
 def pcd_viewpoint(content: bytes) -> np.ndarray | None:

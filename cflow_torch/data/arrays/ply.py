@@ -11,7 +11,7 @@ from typing import Mapping, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.data.arrays.cloud_text import with_plain_nan
+from cflow_torch.data.arrays.cloud_text import numbers_of, with_plain_nan
 from cflow_torch.data.column_names import distinct_names
 
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -84,30 +84,24 @@ def _parsed(content: bytes) -> tuple[str, list[_Element], bytes]:
 
 
 def _text_table(body: bytes, before: Sequence[_Element], vertex: _Element) -> np.ndarray:
-    lines = [line for line in with_plain_nan(body).decode("latin-1").splitlines() if line.strip()]
+    lines = [line.split() for line in with_plain_nan(body).splitlines() if line.strip()]
     first = sum(element.num_rows for element in before)
-    rows = lines[first : first + vertex.num_rows]
-    if vertex.has_lists:
-        rows = [" ".join(_without_lists(row.split(), vertex)) for row in rows]
+    rows = [_without_lists(words, vertex) for words in lines[first : first + vertex.num_rows]]
     table = np.zeros(len(rows), vertex.scalars)
-    names = vertex.scalars.names or ()
-    numbers = np.loadtxt(rows, ndmin=2) if rows else np.zeros((0, len(names)))  # float64 holds every number
-    if numbers.shape[1] != len(names):
-        raise ValueError(f"its vertices have {numbers.shape[1]} numbers, not {len(names)}")
-    for name, column in zip(names, numbers.T):
-        with np.errstate(all="ignore"):  # a number that does not fit is found below
-            table[name] = column
-        if table[name].dtype.kind in "iu" and not np.array_equal(table[name], column):
-            raise ValueError(f"its property {name} has numbers that {vertex.scalars[name].name} does not have")
+    for k, name in enumerate(vertex.scalars.names or ()):
+        table[name] = numbers_of([words[k] for words in rows], vertex.scalars[name])
     return table
 
 
-def _without_lists(words: Sequence[str], vertex: _Element) -> list[str]:
+def _without_lists(words: Sequence[bytes], vertex: _Element) -> list[bytes]:
+    """Return the words of a vertex that are not in lists; if there are more or fewer, that is a ValueError."""
     kept, position = [], 0
     for one in vertex.properties:
         if one.length_kind is None:
             kept.append(words[position])
         position += 1 if one.length_kind is None else 1 + int(words[position])
+    if position != len(words):
+        raise ValueError(f"a vertex has {len(words)} numbers, not {position}")
     return kept
 
 

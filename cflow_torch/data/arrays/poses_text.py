@@ -14,7 +14,7 @@ from cflow_torch.data.arrays.tables import MATRIX, Table, parse_table, tables_of
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key, visible
-from cflow_torch.data.npy_file import parse_npy
+from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, read_bytes, suffix_of
 from cflow_torch.data.trajectory import Trajectory, checked_poses, positions_of_degrees
 from cflow_torch.transforms import ROUNDING, as_matrix, poses_from_quaternions, rotations_of
@@ -37,6 +37,7 @@ _UNNAMED = {
 }
 """What columns without names hold, by their number."""
 _QUATERNION_FIRST = ("q0", "q1", "q2", "q3", *_POSITION)  # 7 numbers, or 8 with the time, whose last four are none
+_OF_LISTS = dict(zip(_TUM[4:], _QUATERNION_FIRST))
 _UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four are not a quaternion; 6 have no time
 STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz", ".npy")
 """Suffixes of files that must be whole to be read, see `tables_of_values`."""
@@ -83,7 +84,7 @@ def files_of_poses(folder: Path) -> list[Path]:
 def parse_poses(content: bytes, path: Path) -> Trajectory:
     """Return the poses in the content of a file of text or `STRUCTURED`."""
     if suffix_of(path) == ".npy":
-        numbers = parse_npy(content, path, "pass a .npy file of (K, 4, 4) numbers")
+        numbers = read_npy(path, "pass a .npy file of (K, 4, 4) numbers", content)
         if numbers.shape in ((3, 4), (4, 4)):  # of a folder with a file per pose
             numbers = numbers[None]
         if numbers.ndim == 2 and numbers.shape[1] in _UNNAMED and numbers.dtype.kind in "fiu":
@@ -93,7 +94,7 @@ def parse_poses(content: bytes, path: Path) -> Trajectory:
         return _poses_of_table(parse_table(content, path), path)
     error = CFlowError(f"{path} has no list of poses: matrices of 16 or 12 numbers, or positions and rotations")
     found = []
-    for table in tables_of_values(content, path):
+    for table in map(_with_sevens, tables_of_values(content, path)):
         if _roles(table.names):
             try:
                 found.append(_poses_of_table(table, path))
@@ -102,6 +103,17 @@ def parse_poses(content: bytes, path: Path) -> Trajectory:
     if not found:
         raise error
     return max(found, key=lambda each: len(each.poses))  # ties: the outer one; calibrations have fewer
+
+
+def _with_sevens(table: Table) -> Table:
+    """Name the numbers of lists of seven, such as pose.0 to pose.6, if four are a quaternion, with w first or last."""
+    names = list(table.names)
+    for stem in [name[:-1] for name in names if name == "0" or name.endswith(".0")]:
+        columns = [names.index(f"{stem}{k}") for k in range(8) if f"{stem}{k}" in names]
+        roles = _layout(table.words[:, columns], False) if len(columns) == 7 else ()
+        for column, role in zip(columns, roles if "time" not in roles else ()):
+            names[column] = _OF_LISTS.get(role, role)
+    return table._replace(names=names)
 
 
 def _poses_of_table(table: Table, path: Path) -> Trajectory:

@@ -32,7 +32,7 @@ from cflow_torch.data.log_motion import fits_better
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, read_bytes, read_start, stem_of, suffix_of
 from cflow_torch.data.point_times import find_times
-from cflow_torch.data.trajectory import Trajectory, checked_poses, fit_to_sweeps
+from cflow_torch.data.trajectory import Trajectory, checked_poses
 from cflow_torch.transforms import poses_from_quaternions, rigid_transform, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.returns import missing_returns
@@ -125,7 +125,10 @@ class ArraysLog(Log):
             self._note(f"the times of its sweeps are those of {table.name}")
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
-        self.poses = None if trajectory is None else self._pose_per_sweep(_of_ego(trajectory, whose, mounting), stamps)
+        self.poses = None
+        if trajectory is not None:
+            frame_T_ego = {"lidar": np.linalg.inv(mounting), "sensor": mounting}.get(whose, np.eye(4))
+            self._take_poses(trajectory._replace(poses=trajectory.poses @ frame_T_ego))
         self.gaps |= frozenset(self._gaps_in_numbers())
         self._note(f"its poses come from {_VIEWPOINT}" if self.has_viewpoints else "")
         if whose == "auto" and ego_T_lidar is not None and self.poses is not None:
@@ -313,31 +316,27 @@ class ArraysLog(Log):
         is_near_end = self._numbers_are_rows or max(of_files) >= _LEAST_REACH * max(row_of)
         return rows if is_near_end and (rows >= 0).mean() > least else None
 
-    def _pose_per_sweep(self, trajectory: Trajectory, stamps: list[int] | None) -> np.ndarray:
-        trajectory = trajectory.counted(stamps)
+    def _take_poses(self, trajectory: Trajectory) -> None:
+        """Take the pose of each sweep, by its time or its row, and leave out sweeps that have none."""
+        trajectory = trajectory.counted(self.timestamps if self._has_times else None)
         source = trajectory.source
-        rows = np.arange(len(self.files))
-        if trajectory.times_ns is not None and stamps is not None:
-            poses, is_known, note = fit_to_sweeps(trajectory, stamps)
-            self._note(note)
-            self.has_sparse_poses = trajectory.is_sparse(stamps)
-            self.trajectory = trajectory.times_ns, trajectory.poses
+        where = f"{self.folder}: without the sweeps that have no pose, it"
+        if trajectory.times_ns is not None and self._has_times:
+            kept = self._use_poses(trajectory, where)
         else:
-            given = self._rows(len(trajectory.poses), trajectory.labels, f"poses in {source}")
-            if given is None:
+            rows = self._rows(len(trajectory.poses), trajectory.labels, f"poses in {source}")
+            if rows is None:
                 raise CFlowError(
                     f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, or poses "
                     "with times (TUM) and the times of the sweeps in times.txt, or none (data.poses=null)"
                 )
-            rows = given
             is_known = np.isfinite(trajectory.poses[rows]).all(axis=(1, 2)) & (rows >= 0)
             if not is_known.all():
                 count = f"{(~is_known).sum()} of {len(rows)} sweeps"
                 self._note(f"{count} have no pose, or one of NaN or zeros, in {source} and are left out")
-            poses = trajectory.poses[rows][is_known]
-        kept = self._keep(is_known, f"{self.folder}: without the sweeps that have no pose, it")
+            kept = self._keep(is_known, where)
+            self.poses = trajectory.poses[rows[kept]]
         self.files = [self.files[k] for k in kept]
-        return poses
 
     def _gaps_in_numbers(self) -> list[int]:
         """Return the indices of files without times after which others are missing, by the numbers in their names."""
@@ -352,13 +351,6 @@ class ArraysLog(Log):
         missing = f"sweeps are missing by the numbers of its files, first after {first}"
         self._note(f"{missing}; no history or future of a window reaches over them")
         return gaps  # type: ignore[no-any-return]
-
-
-def _of_ego(trajectory: Trajectory, whose: str, mounting: np.ndarray) -> Trajectory:
-    """Return the poses of the ego frame, from those of the LiDAR or of a sensor to which `mounting` maps points."""
-    if whose == "lidar":
-        return trajectory.seen_from(np.linalg.inv(mounting))
-    return trajectory.seen_from(mounting) if whose == "sensor" else trajectory
 
 
 def _are_regular(numbers: Sequence[int]) -> bool:

@@ -80,22 +80,22 @@ def times_of_names(names: Sequence[str]) -> list[int] | None:
         return None
     names = _without_counters(names)
     if all(map(_DIGITS.search, names)):
-        names = [_DIGITS.sub(_with_separators, name) for name in names]
+        date = r"\1-\2-\3T\4:\5:\6"
+        names = [_DIGITS.sub(lambda found: found.expand(date + (r".\7" if found[7] else "")), name) for name in names]
     stamps = [_STAMP.search(name) for name in names]
     seconds = [[pattern.search(name) for name in names] for pattern in _SECONDS]
     if all(stamps):
         times = nanoseconds_of_numbers([stamp[1] for stamp in stamps if stamp])
     for matches in seconds:
         if times is None and all(matches):
-            times = _with_fractions([(match[1], match[2]) for match in matches if match])
+            pairs = [(match[1], match[2]) for match in matches if match]
+            digits = {len(fraction) for _, fraction in pairs}
+            are_decimals = max(digits) != 9 or len(digits) == 1
+            fractions = [int(fraction[:9].ljust(9, "0") if are_decimals else fraction) for _, fraction in pairs]
+            times = [int(second) * 10**9 + fraction for (second, _), fraction in zip(pairs, fractions)]
     times = times or nanoseconds_of_dates(names)
     are_times = times is not None and max(times) < _LIMIT and len(set(times)) == len(times)
     return times if are_times else None
-
-
-def _with_separators(date: re.Match[str]) -> str:
-    *numbers, fraction = date.groups()
-    return "{}-{}-{}T{}:{}:{}".format(*numbers) + (f".{fraction}" if fraction else "")
 
 
 def _without_counters(names: Sequence[str]) -> Sequence[str]:
@@ -112,10 +112,3 @@ def _without_counters(names: Sequence[str]) -> Sequence[str]:
     cut = [name[: match.start()] for name, match in zip(names, last)]
     has_times = any(all(map(pattern.search, cut)) for pattern in (_STAMP, _DATE, _CLOCK, *_SECONDS))
     return cut if is_counter and (has_times or numbers[0] < 1000) else names
-
-
-def _with_fractions(pairs: Sequence[tuple[str, str]]) -> list[int]:
-    digits = {len(fraction) for _, fraction in pairs}
-    are_decimals = max(digits) != 9 or len(digits) == 1
-    fractions = [int(fraction[:9].ljust(9, "0") if are_decimals else fraction) for _, fraction in pairs]
-    return [int(second) * 10**9 + fraction for (second, _), fraction in zip(pairs, fractions)]

@@ -18,15 +18,14 @@ from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.paths import read_bytes, suffix_of
-from cflow_torch.transforms import ROUNDING
 
 _FEWEST_NUMBERS = 7  # of a pose
+_LETTERS = re.compile("[A-Za-z]")
 COMMENTS = ("#", "%", "//")
 """Beginnings of lines that are no rows."""
 MATRIX = tuple(f"m{k}" for k in range(16))
 """Names of the entries of a matrix, row by row or column by column; the last four may be missing."""
 # Numbers in a list of a JSON file, and the role that the name of the list has -> endings of their names, else 0, 1, ...
-_PLACE, _FOUR = ("x", "y", "z"), ("q0", "q1", "q2", "q3")  # of lists of seven; w is the first of four or the last
 _VECTORS: dict[Any, Sequence[Any]] = {(3, "x"): ("x", "y", "z"), (3, "qx"): ("roll", "pitch", "yaw")}
 
 
@@ -48,7 +47,7 @@ def parse_table(content: bytes, path: Path) -> Table:
         lines = _poses_only([line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()])
         start, names = start_of_rows(lines, _FEWEST_NUMBERS)
         rows = [split_line(line) for line in lines[start:] if not line.startswith(COMMENTS)]
-        texts = [line for line in lines[:start] if _has_letters(line) and not line.startswith(COMMENTS)]
+        texts = [line for line in lines[:start] if _LETTERS.search(line) and not line.startswith(COMMENTS)]
         width = min(map(len, rows), default=0)
         is_uneven = any(any(row[width:]) for row in rows)  # a line may lack the comma at the end of others
         if not rows or is_uneven or (len(texts) > 1 and not names):
@@ -73,26 +72,22 @@ def start_of_rows(lines: Sequence[str], fewest: int) -> tuple[int, list[str]]:
     """
     plain = [line for line in lines if line and not line.startswith(COMMENTS)]
     width = len(split_line(plain[len(plain) // 2])) if plain else 0
-    start = next((k for k, line in enumerate(lines) if _is_row(line, width, fewest)), len(lines))
+    start = len(lines)
+    for k, line in enumerate(lines):
+        words = split_line(line)
+        count = sum(is_number(_seconds_of_dates([word])[0]) for word in words)
+        is_row = count + words.count("") == width or count >= fewest
+        if is_row and len(words) == width and not line.startswith(COMMENTS):
+            start = k
+            break
     ends_empty = start < len(lines) and split_line(lines[start])[-1] == ""
     found = []
-    for line in filter(_has_letters, reversed(lines[:start])):
+    for line in filter(_LETTERS.search, reversed(lines[:start])):
         header = line.lstrip("#%/ ")
         names = re.split("[,;]" if re.search("[,;]", header) else r"\s+", header)
         names += [""] * (ends_empty and len(names) == width - 1)  # each row ends with a comma
         found += [[name.strip(' "') for name in names]] * (len(names) == width)
     return start, min(found, key=lambda names: len(set(names)) < width, default=[])
-
-
-def _is_row(line: str, width: int, fewest: int) -> bool:
-    words = split_line(line)
-    count = sum(is_number(_seconds_of_dates([word])[0]) for word in words)
-    is_row = count + words.count("") == width or count >= fewest
-    return is_row and len(words) == width and not line.startswith(COMMENTS)
-
-
-def _has_letters(line: str) -> bool:
-    return re.search("[A-Za-z]", line) is not None
 
 
 def _seconds_of_dates(column: Sequence[str]) -> Sequence[str]:
@@ -130,9 +125,11 @@ def tables_of_values(content: bytes, path: Path) -> Iterator[Table]:
         names = max(rows, key=len, default={}).keys()
         if not names or 2 * sum(row.keys() == names for row in rows) <= len(rows):
             continue
-        texts = labels or [_text_of(member) for member in members]
+        # Without a name, the first text in a row is its name.
+        fields = [list(member.values()) if isinstance(member, dict) else [] for member in members]
+        texts = labels or [next((each for each in row if isinstance(each, str)), "") for row in fields]
         words = np.array([[row.get(name, "nan") for name in names] for row in rows], str)
-        yield Table(_name_sevens(list(names), words), words, texts if len({*texts, ""}) > len(texts) else [])
+        yield Table(list(names), words, texts if len({*texts, ""}) > len(texts) else [])
 
 
 def _value_of(content: bytes, path: Path) -> Any:
@@ -200,32 +197,6 @@ def _numbers_of(value: Any, name: str) -> Iterator[tuple[str, str]]:
     elif isinstance(value, dict):
         for key, member in value.items():
             yield from _numbers_of(member, f"{name}.{key}" if name else key)
-
-
-def _name_sevens(names: list[str], words: np.ndarray) -> list[str]:
-    """Return the names of columns, and name those of lists of seven numbers: a position and a quaternion, or reversed.
-
-    The quaternion has length 1 in most rows. If both ends have, it is the one that varies less.
-    """
-    named = list(names)
-    for name in [name for name in names if name == "0" or name.endswith(".0")]:
-        columns = [names.index(f"{name[:-1]}{k}") for k in range(7) if f"{name[:-1]}{k}" in names]
-        if len(columns) != 7 or f"{name[:-1]}7" in names:
-            continue
-        values = words[:, columns].astype(np.float64)
-        values = values[np.isfinite(values).all(axis=1)]
-        fours = {start: values[:, start : start + 4] for start in (3, 0)}
-        units = [k for k, four in fours.items() if (np.abs(np.linalg.norm(four, axis=1) - 1) < ROUNDING).mean() > 0.5]
-        if len(values) and units:
-            start = min(units, key=lambda k: float(fours[k].std(axis=0).sum()))
-            for column, found in zip(columns, (*_PLACE, *_FOUR) if start else (*_FOUR, *_PLACE)):
-                named[column] = found
-    return named
-
-
-def _text_of(value: Any) -> str:
-    texts = [each for each in value.values() if isinstance(each, str)] if isinstance(value, dict) else []
-    return texts[0] if texts else ""
 
 
 def split_line(line: str) -> list[str]:

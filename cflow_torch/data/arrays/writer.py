@@ -89,7 +89,12 @@ def cloud_names(log: Log) -> list[str]:
 def write_sweep(file: Path, log: Log, index: int, sweep: Sweep, viewpoint: str | None) -> None:
     """Write the points and the other columns of sweep `index`; `viewpoint` as in `write_array_log`."""
     points = np.asarray(sweep.points)[:, :3]
-    where = None if viewpoint is None else _viewpoint(sweep.pose, f"log {log.log_id}: sweep {index}")
+    where = None
+    if viewpoint is not None:  # x, y, z and quaternion w, x, y, z of the pose
+        if sweep.pose is None:
+            raise CFlowError(f"log {log.log_id}: sweep {index} has no pose for VIEWPOINT; pass viewpoint=None")
+        pose = np.asarray(sweep.pose, np.float64)
+        where = [*pose[:3, 3].tolist(), *to_quaternions(pose[None, :3, :3])[0].tolist()]
     if viewpoint == "world":
         points = in_single(transform_points(points, np.asarray(sweep.pose)))
     write_cloud(file, points, log.columns(index), where)
@@ -109,11 +114,3 @@ def write_sides(folder: Path, log_id: str, sides: Mapping[str, SweepSides], has_
         raise CFlowError(f"log {log_id} has no pose of sweep {has_pose.index(False)}: give all poses or none")
     if all(has_pose) and not has_viewpoints:
         write_kitti_poses(folder / "poses.txt", np.stack(poses))
-
-
-def _viewpoint(pose: Any, what: str) -> list[float]:
-    """Return x, y, z and quaternion w, x, y, z of a pose."""
-    if pose is None:
-        raise CFlowError(f"{what} has no pose for VIEWPOINT; pass viewpoint=None")
-    matrix = np.asarray(pose, np.float64)
-    return [*matrix[:3, 3].tolist(), *to_quaternions(matrix[None, :3, :3])[0].tolist()]

@@ -6,6 +6,7 @@ import os
 import re
 from contextlib import closing, suppress
 from importlib.metadata import version
+from operator import methodcaller
 from pathlib import Path
 from typing import Any, Sequence
 
@@ -19,7 +20,7 @@ from cflow_torch.data.folders import search, visible
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
 from cflow_torch.data.point_times import find_times
-from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
+from cflow_torch.data.trajectory import Trajectory
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep
@@ -68,10 +69,7 @@ def find_bags(root: PathLike) -> list[Path]:
     drive_1.bag, ... are the parts of one bag, also if the time of each part is in its name. The bag is called by its
     first part, and `BagLog` opens them all.
     """
-    root = as_path(root)
-    if root.is_file():
-        return [root]
-    return sorted(search(root, _bags_in, SEARCH_DEPTH, "a bag, or a folder of bags"))
+    return sorted(search(as_path(root), _bags_in, SEARCH_DEPTH, "a bag, or a folder of bags"))
 
 
 class BagLog(Log):
@@ -119,12 +117,14 @@ class BagLog(Log):
         if is_remote(self.path):
             raise CFlowError(f"{self.path} is remote: bags are read from this machine only; copy it here")
         self._files = _parts(self.path)
-        self.log_id = _name_of(self.path, len(self._files) > 1)
+        name = self.path.resolve()
+        stem = _PART.sub(r"\1", name.stem) if len(self._files) > 1 else name.stem  # that of parts has no number
+        self.log_id = name.name if name.is_dir() else stem
         if self.path.suffix == _ACTIVE:
             raise CFlowError(
                 f"{self.path} is a recording that was not finished: run rosbag reindex, then rename it .bag"
             )
-        self.poses: np.ndarray | None = None
+        self.poses = None
         self._opened: tuple[int, Any] = (0, None)
         self._mount = None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         hint = f"is it a complete bag of ROS 1 (.bag), ROS 2 (folder) or MCAP? {_REPAIR}"
@@ -137,7 +137,7 @@ class BagLog(Log):
             self._check_count(f"{self.path}: {self.topic}")
             trajectory = self._find_poses(topics, poses, tracks)
             if trajectory is not None:
-                self._use_poses(trajectory)
+                self._use_poses(trajectory, f"{self.path}: {self.topic}, while there are poses,")
             self._period = float(np.median(np.diff(self.timestamps))) * 1e-9
             self.lidar_position = self._mount_at(self.timestamps[0])[:3, 3]
 
@@ -171,7 +171,8 @@ class BagLog(Log):
             return Trajectory(matrices, times, False, f"{source} of {self.path}")
         if poses is None:
             return None
-        near = find_poses_near(self.path.parent, self.log_id, self.timestamps, self._is_covered_by, self._note)
+        fits = methodcaller("covers", self.timestamps)
+        near = find_poses_near(self.path.parent, self.log_id, self.timestamps, fits, self._note)
         if near is None:
             self._note(self._other_bag_with_poses())
         return near
@@ -190,17 +191,6 @@ class BagLog(Log):
                 what = f"{bag.relative_to(parent)} next to it has {', '.join(moving)} of the same time"
                 return f"{what}, which we do not read: merge both by rosbags-convert --src {files} --dst merged"
         return ""
-
-    def _is_covered_by(self, trajectory: Trajectory) -> bool:
-        return trajectory.covers(self.timestamps)
-
-    def _use_poses(self, trajectory: Trajectory) -> None:
-        """Take poses with times, and keep the sweeps that have one."""
-        self.trajectory = np.asarray(trajectory.times_ns), trajectory.poses
-        self.poses, is_covered, note = fit_to_sweeps(trajectory, self.timestamps)
-        self._note(note)
-        self.has_sparse_poses = trajectory.is_sparse(self.timestamps)
-        self._keep(is_covered, f"{self.path}: {self.topic}, while there are poses,")
 
     def _mount_at(self, time: int) -> np.ndarray:
         """Return `T_ego_lidar` at a time, (4, 4) float64."""
@@ -440,15 +430,6 @@ class BagLog(Log):
             raise CFlowError("the cloud is gone; was the bag changed?")
 
 
-def _name_of(path: Path, has_parts: bool) -> str:
-    """Return the name of a bag; that of a file with parts has no number."""
-    stem = path.resolve().stem
-    part = _PART.fullmatch(stem) if has_parts else None
-    if path.is_dir():
-        return path.resolve().name
-    return part[1] if part else stem
-
-
 def _middle(values: list[int]) -> int:
     return sorted(values)[len(values) // 2] if values else 0
 
@@ -487,7 +468,7 @@ def _check_version(files: list[Path]) -> None:
 
 
 def _bags_in(folder: Path) -> list[Path]:
-    if (folder / "metadata.yaml").is_file():
+    if folder.is_file() or (folder / "metadata.yaml").is_file():
         return [folder]
     files = [file for file in visible(folder) if file.suffix in (*SUFFIXES, _ACTIVE) and file.is_file()]
     parts = {part for file in files for part in _parts(file, files)[1:]}
@@ -522,7 +503,11 @@ def _topics_of_poses(files: list[Path], first_ns: int, last_ns: int) -> list[str
 
 
 def _parts(path: Path, files: Sequence[Path] | None = None) -> list[Path]:
-    """Return the paths that rosbags must open for a bag. `files` are those next to it; None = we list them."""
+    """Return the paths that rosbags must open for a bag. `files` are those next to it; None = we list them.
+
+    Parts of a recording have one name, apart from the number and the time. They start with the first part or later, but
+    before the first part of the next recording of this name.
+    """
     if path.is_dir():
         description = path / "metadata.yaml"
         text = description.read_text("utf-8", "replace") if description.is_file() else ""
@@ -530,41 +515,25 @@ def _parts(path: Path, files: Sequence[Path] | None = None) -> list[Path]:
         if all((path / name).is_file() for name in named):
             return [path]
         renamed = [file for file in visible(path) if file.suffix in SUFFIXES]
-        return sorted(renamed, key=_part_number) or [path]
-    match = _PART.fullmatch(path.stem)
-    if match is None or int(match[2]) != 0:
-        return [path]
-    parts = [path]
-    for file in _parts_after(path, list(path.parent.glob("*")) if files is None else files):
-        if _part_number(file) == len(parts):
+        return sorted(renamed, key=lambda file: _part_of(file)[2]) or [path]
+    name, first, _ = _part_of(path)
+    others = list(path.parent.glob("*")) if files is None else files
+    known = [(*_part_of(file), file) for file in others if file.suffix == path.suffix]
+    known = [each for each in known if each[0] == name and each[1] >= first and each[2] >= 0]
+    end = min((start for _, start, number, _ in known if number == 0 and start > first), default=None)
+    after = sorted((number, file) for _, start, number, file in known if end is None or start < end)
+    numbers = [number for number, _ in after]
+    parts: list[Path] = []
+    for number, file in after:
+        # Two files of one number are of two recordings at a time, if their names have times.
+        if number == len(parts) and (not first or numbers.count(number) == 1):
             parts.append(file)
-    return parts
+    return parts if path in parts[:1] else [path]
 
 
-def _parts_after(path: Path, files: Sequence[Path]) -> list[Path]:
-    """Return which files may be parts of the bag with this first part, in the order of their numbers.
-
-    They start with the first part or later, but before the first part of the next recording of this name.
-    """
-    name, first = _recording(path)
-    others = [file for file in files if file.name.endswith(path.suffix) and _PART.fullmatch(file.stem)]
-    starts = {file: start for file in others for each, start in [_recording(file)] if each == name}
-    later = [start for file, start in starts.items() if _part_number(file) == 0 and start > first]
-    end = min(later, default=None)
-    after = [file for file, start in starts.items() if first <= start and (end is None or start < end)]
-    numbers = [_part_number(file) for file in after]
-    # Two files of one number are of two recordings at a time, if their names have times.
-    return sorted((file for file in after if not first or numbers.count(_part_number(file)) == 1), key=_part_number)
-
-
-def _recording(file: Path) -> tuple[str, str]:
-    """Return the name of a file without its number and time, which its parts share, and the time, "" = none."""
+def _part_of(file: Path) -> tuple[str, str, int]:
+    """Return the name of a file without its time and number, the time, "" = none, and the number, -1 = none."""
     match = _PART.fullmatch(file.stem)
-    stem = match[1] if match else file.stem
+    stem, number = (match[1], int(match[2])) if match else (file.stem, -1)
     start = _START.search(stem)
-    return _START.sub("", stem, count=1), start[0] if start else ""
-
-
-def _part_number(file: Path) -> int:
-    match = _PART.fullmatch(file.stem)
-    return int(match[2]) if match else 0
+    return _START.sub("", stem, count=1), start[0] if start else "", number

@@ -6,14 +6,14 @@ import re
 import weakref
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Sequence
+from typing import Any
 
 import numpy as np
 
 from cflow_torch.data.arrays.cloud_file import in_single
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.folders import visible
+from cflow_torch.data.folders import search, visible
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, source_for_random_access
@@ -37,17 +37,11 @@ def find_hdf5_scenes(root: PathLike) -> list[Path]:
 
     A missing path is a `CFlowError`.
     """
-    root = as_path(root)
-    if root.is_file():
-        return [root]
-    if not root.is_dir():
-        raise CFlowError(f"{root} is neither a file nor a folder; pass a scene (.h5) or a folder of scenes")
-    below = [path for folder in visible(root) for path in visible(folder)]
-    return sorted(_scenes(visible(root))) or sorted(_scenes(below))
 
+    def scenes_in(folder: Path) -> list[Path]:
+        return [folder] if folder.is_file() else [path for path in visible(folder) if path.suffix == ".h5"]
 
-def _scenes(paths: Sequence[Path]) -> list[Path]:
-    return [path for path in paths if path.suffix == ".h5"]
+    return sorted(search(as_path(root), scenes_in, 1, "a scene (.h5), or a folder of scenes"))
 
 
 class HDF5Log(Log):
@@ -108,6 +102,15 @@ class HDF5Log(Log):
         points = self._values(index, "lidar")[:, :3]
         points = points if points.dtype == np.float64 else points.astype(np.float32)
         is_missing = missing_returns(points) | (np.abs(points) > np.finfo(np.float32).max).any(axis=1)
+        time = None if self.timestamps[-1] < _FIRST_MICROSECOND else timestamp  # None: the groups are numbered
+        times = self._values(index, "lidar_dt", rows)
+        if times is not None and np.abs(times).max(initial=0) > _LONGEST_LAG:  # of another unit or clock
+            period = None if time is None else float(np.median(np.diff(self.timestamps))) * 1e-9
+            found = find_times({"time": times}, time, period, self._note, is_missing)
+            times = None if found is None else found.seconds
+            is_missing |= False if found is None else found.is_stray
+        elif times is not None:
+            times = times.astype(np.float32)
         if is_missing.any():
             points = np.where(is_missing[:, None], points.dtype.type(np.nan), points)
         is_ground = self._values(index, "ground_mask", rows, np.bool_)
@@ -119,25 +122,9 @@ class HDF5Log(Log):
             )
         if pose is not None and not np.array_equal(self.ego_T_lidar, np.eye(4)):
             pose = rigid_transform(pose, f"pose of sweep {self.sweep_name(index)} in {self.file}") @ self.ego_T_lidar
-        time = None if self.timestamps[-1] < _FIRST_MICROSECOND else timestamp  # None: the groups are numbered
         if pose is not None and not np.isfinite(pose).all():
             raise CFlowError(f"{self.file}: the pose of sweep {self.sweep_name(index)} is not finite")
-        times = self._point_times(index, time, points, is_missing)
         return Sweep(in_single(points), is_ground, pose, time, times)
-
-    def _point_times(
-        self, index: int, time: int | None, points: np.ndarray, is_missing: np.ndarray
-    ) -> np.ndarray | None:
-        """Read the (N,) seconds from the sweep to its points; those of another unit or clock are converted."""
-        times = self._values(index, "lidar_dt", self._rows(index))
-        if times is None or np.abs(times).max(initial=0) <= _LONGEST_LAG:
-            return times if times is None else times.astype(np.float32)
-        period = None if time is None else float(np.median(np.diff(self.timestamps))) * 1e-9
-        found = find_times({"time": times}, time, period, self._note, is_missing)
-        if found is None or found.seconds is None:
-            return None
-        points[found.is_stray] = np.nan
-        return np.where(found.is_stray, 0, found.seconds)
 
     def _labels(self, index: int) -> FlowLabels | None:
         rows = self._rows(index)
@@ -212,24 +199,19 @@ class HDF5Log(Log):
     def _stored_pose(self, index: int, dtype: Any = np.float64) -> Any:
         """Read a pose, or compute it from the pose before and the ego motion; None = it is unknown."""
         pose = self._matrix(index, "pose", dtype)
-        while pose is None and len(self._chain) <= index:
-            self._chain.append(self._next_in_chain())
-        return self._chain[index] if pose is None else pose
-
-    def _next_in_chain(self) -> np.ndarray | None:
-        """Return the pose of the sweep after those of the chain; without poses, the world is the first ego frame."""
-        index = len(self._chain)
-        stored = self._matrix(index, "pose", np.float64)
-        if stored is not None:
-            return stored
-        if index == 0:
-            has_motions = self._matrix(0, "ego_motion", np.float64) is not None
-            return np.eye(4) if has_motions and self._matrix(1, "pose", np.float64) is None else None
-        motion = self._matrix(index - 1, "ego_motion", np.float64)
-        if motion is None or self._chain[-1] is None:
-            return None
-        motion = rigid_transform(motion, f"ego_motion of sweep {self.sweep_name(index - 1)} in {self.file}")
-        return self._chain[-1] @ np.linalg.inv(motion)  # type: ignore[no-any-return]
+        if pose is not None:
+            return pose
+        for k in range(len(self._chain), index + 1):
+            pose = self._matrix(k, "pose", np.float64)
+            motion = None if pose is not None else self._matrix(max(k - 1, 0), "ego_motion", np.float64)
+            if pose is None and k == 0:  # without poses, the world is the first ego frame
+                has_motions = motion is not None and self._matrix(1, "pose", np.float64) is None
+                pose = np.eye(4) if has_motions else None
+            elif pose is None and motion is not None and self._chain[-1] is not None:
+                motion = rigid_transform(motion, f"ego_motion of sweep {self.sweep_name(k - 1)} in {self.file}")
+                pose = self._chain[-1] @ np.linalg.inv(motion)
+            self._chain.append(pose)
+        return self._chain[index]
 
     def _stated_extrinsics(self) -> np.ndarray:
         """Return the extrinsics of the scene's attribute, otherwise the recognised ones."""

@@ -41,10 +41,12 @@ _CLASSES = {
     "REGULAR_VEHICLE": (10, 252),
     "TRUCK": (18, 258),
 }
-_MOVING = (251, 259)  # the first and last class of moving points; 251 in labels that tell only static (9) and moving
+MOVING = tuple(range(251, 260))  # classes of moving points; 251 in labels that tell only static (9) and moving
 GROUND = (40, 44, 48, 49, 60, 72)  # road, parking, sidewalk, other ground, lane marking, terrain
 UNLABELLED = (0, 1)  # unlabelled, outlier
-_NUM_CLASSES = 1 << 16
+CATEGORY_OF_CLASS = np.zeros(1 << 16, np.uint8)  # Argoverse 2 index of each class, 0 = background
+for _name, _classes in _CLASSES.items():
+    CATEGORY_OF_CLASS[list(_classes)] = CATEGORY_INDEX[_name]
 _OUT_OF_IMAGE = 2  # truncation of a tracklet's pose
 # Axes of a box (x along its length, y left, z up) in the axes of an object in the camera's frame (x along its length, y
 # down, z right of x).
@@ -56,6 +58,9 @@ class FrameBoxes(NamedTuple):
 
     boxes: Boxes
     ignored: np.ndarray
+
+
+NO_BOXES = FrameBoxes(Boxes([], [], [], []), np.zeros((0, 4)))
 
 
 def read_tracklets(file: Path) -> dict[int, FrameBoxes]:
@@ -76,12 +81,12 @@ def read_tracklets(file: Path) -> dict[int, FrameBoxes]:
                     rows.setdefault(first_frame + step, []).append(
                         (str(number), track.findtext("objectType"), size, place)
                     )
-        return {frame: _upright(*zip(*of_frame)) for frame, of_frame in rows.items()}
+    return {frame: _upright(*zip(*of_frame)) for frame, of_frame in rows.items()}
 
 
 def _upright(tracks: Sequence[str], kinds: Sequence[str], sizes: Any, places: Any) -> FrameBoxes:
     boxes = Boxes(tracks, category_indices(kinds, CATEGORY_NAME), sizes, upright_poses(places))
-    return FrameBoxes(boxes, np.zeros((0, 4)))
+    return NO_BOXES._replace(boxes=boxes)
 
 
 def read_tracking_labels(file: Path, T_lidar_camera: np.ndarray) -> dict[int, FrameBoxes]:
@@ -124,20 +129,3 @@ def read_classes(file: Path, rows: int) -> tuple[np.ndarray, np.ndarray]:
     if len(values) != rows:
         raise CFlowError(f"{file} has {len(values)} labels for {rows} points; copy it again")
     return (values & 0xFFFF).astype(np.uint16), (values >> 16).astype(np.uint16)
-
-
-def are_moving(classes: np.ndarray) -> np.ndarray:
-    first, last = _MOVING
-    return (classes >= first) & (classes <= last)
-
-
-def class_categories() -> np.ndarray:
-    """Return the Argoverse 2 index of each class of SemanticKITTI, (65536,) uint8, 0 = background."""
-    table = np.zeros(_NUM_CLASSES, np.uint8)
-    for name, classes in _CLASSES.items():
-        table[list(classes)] = CATEGORY_INDEX[name]
-    return table
-
-
-def no_boxes() -> FrameBoxes:
-    return FrameBoxes(Boxes([], [], [], []), np.zeros((0, 4)))

@@ -86,20 +86,18 @@ class KITTILog(ArraysLog):
             else:
                 super().__init__(source.clouds, None if is_auto else poses, times=None, ground=None)
         self.log_id = source.name
-        self._frames = [int(file.stem) for file in self.files]
         if source.layout == "raw":
             self._read_times()
         trajectory = None
         if is_auto and not is_sequence:
             trajectory = self._poses_of_oxts() if _kitti360(root) is None else self._poses_of_kitti360()
         if trajectory is not None:
-            self.poses = self._pose_per_sweep(trajectory, list(self.timestamps) if self._has_times else None)
-            self._frames = [int(file.stem) for file in self.files]
+            self._take_poses(trajectory)
             self.gaps |= frozenset(self._gaps_in_numbers())
 
     def frame_number(self, index: int) -> int:
         self._timestamp(index)
-        return self._frames[index]
+        return int(self.files[index].stem)
 
     def _gaps_in_numbers(self) -> list[int]:
         return [] if self.drive.layout == "raw" else super()._gaps_in_numbers()  # raw drives have times
@@ -123,7 +121,7 @@ class KITTILog(ArraysLog):
     def moving(self, index: int) -> np.ndarray | None:
         """Read which points of sweep `index` belong to a class of moving points, (N,) bool; None without labels."""
         classes = self.columns(index).get("class")
-        return None if classes is None else stored_labels.are_moving(classes)
+        return None if classes is None else np.isin(classes, stored_labels.MOVING)
 
     def _labels(self, index: int) -> FlowLabels | None:
         boxes = self._boxes
@@ -137,9 +135,9 @@ class KITTILog(ArraysLog):
         if found is not None:
             classes, _ = found
             flow = (transform_points(points, T_ego1_ego0) - points).astype(np.float32)
-            is_valid = ~stored_labels.are_moving(classes) & ~np.isin(classes, stored_labels.UNLABELLED)
-            return FlowLabels(flow, stored_labels.class_categories()[classes], is_valid)
-        pair = [boxes.get(self._frames[k], stored_labels.no_boxes()) for k in (index, index + 1)]
+            is_valid = ~np.isin(classes, (*stored_labels.MOVING, *stored_labels.UNLABELLED))
+            return FlowLabels(flow, stored_labels.CATEGORY_OF_CLASS[classes], is_valid)
+        pair = [boxes.get(self.frame_number(k), stored_labels.NO_BOXES) for k in (index, index + 1)]
         labels = flow_from_boxes(points, pair[0].boxes, pair[1].boxes, T_ego1_ego0)
         return FlowLabels(labels.flow, labels.category, labels.is_valid & self._is_annotated(points, pair[0]))
 
@@ -167,7 +165,7 @@ class KITTILog(ArraysLog):
             lines = read_bytes(file).splitlines()
             times = read_times(file).tolist()
             of_frame = dict(zip((frame for frame, line in enumerate(lines) if line.strip()), times))  # some are empty
-            self.timestamps = [of_frame[frame] for frame in self._frames]
+            self.timestamps = [of_frame[int(file.stem)] for file in self.files]
         self._has_times = True
 
     def _poses_of_oxts(self) -> Trajectory | None:

@@ -48,8 +48,6 @@ def find_waymo_segments(root: PathLike) -> list[Path]:
     Files of version 1 are a `CFlowError`.
     """
     root = as_path(root)
-    if root.is_file() and root.suffix != ".tfrecord":
-        return [root]
     what = "<split>/lidar/<segment>.parquet, or a split"
     root = root.parent if root.name == "lidar" else root
     if root.suffix == ".tfrecord" or next(root.glob("*.tfrecord"), None):
@@ -57,11 +55,12 @@ def find_waymo_segments(root: PathLike) -> list[Path]:
             f"{root}: .tfrecord is version 1 of the Waymo Open Dataset, which we do not read; download the parquet "
             "files of version 2 (same drives): lidar, lidar_pose, lidar_calibration, vehicle_pose, lidar_box"
         )
-    return sorted(search(root, _segments_of, SEARCH_DEPTH, what))
 
+    def segments_of(split: Path) -> list[Path]:
+        files = [path for path in visible(split / "lidar") if path.suffix == ".parquet"]
+        return [split] if split.is_file() else files
 
-def _segments_of(split: Path) -> list[Path]:
-    return [path for path in visible(split / "lidar") if path.suffix == ".parquet"]
+    return sorted(search(root, segments_of, SEARCH_DEPTH, what))
 
 
 class WaymoLog(BoxLog):
@@ -132,7 +131,11 @@ class WaymoLog(BoxLog):
         time = self.timestamps[index] // 1000
         keys = [(time, laser) for laser in self._lasers]
         images = [self._images.images(keys, f"{LIDAR}{number}", 4) for number in self._returns]
-        pixel_poses = self._read_pixel_poses(time)
+        pixel_poses = None
+        if TOP in self._lasers:
+            pixel_poses = self._pixel_poses.images([(time, TOP)], PIXEL_POSE, 6)[time, TOP]
+            if pixel_poses is None:
+                raise CFlowError(f"{self._pixel_poses.file} has no pixel poses of frame {time}; copy it again")
         points = [np.zeros((0, 3))]
         is_zone = [np.zeros(0, dtype=bool)]
         for key in keys:
@@ -145,15 +148,6 @@ class WaymoLog(BoxLog):
                 points.append(of_image)
                 is_zone.append(image.reshape(-1, image.shape[2])[pixels, NO_LABEL_ZONE] == 1)
         return np.concatenate(points).astype(np.float32), np.concatenate(is_zone)
-
-    def _read_pixel_poses(self, time: int) -> np.ndarray | None:
-        """Read the poses of the pixels of TOP, (H, W, 6); None if this laser is not read."""
-        if TOP not in self._lasers:
-            return None
-        poses = self._pixel_poses.images([(time, TOP)], PIXEL_POSE, 6)[time, TOP]
-        if poses is None:
-            raise CFlowError(f"{self._pixel_poses.file} has no pixel poses of frame {time}; copy it again")
-        return poses
 
     def _read_lasers(self) -> dict[int, LaserCalibration]:
         component = Component(self.file, "lidar_calibration")
