@@ -23,6 +23,7 @@ _REACH = 10  # sweeps before and after a pair, whose poses may be those of the p
 # Metres a sweep, of points 20 m away. If it is less, a wrong direction moves static objects by millimetres only.
 _LEAST_SPEED, _LEAST_TIMED = 0.5, 0.1
 _UNCLEAR = 0.2  # share in place, below which poses that hardly move are compared with the motion of the sensor
+_SMALL = 0.15  # share in place, below which sweeps that repeat the one before are looked for
 _LEAST_MOTION = 0.2  # metres between the sweeps of a pair, else the vehicle stands
 # A step between two poses is suspect if it differs from its neighbours' by this length plus this share of theirs. The
 # points then decide. Pairs of sweeps do not reach over steps that differ by the second length and share.
@@ -145,7 +146,8 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     def does_not_fit() -> bool:
         return bool(judgement.best) or (judgement.is_low and not hardly_moves)
 
-    if poses is not None and does_not_fit():  # are only a few sweeps wrong?
+    is_small = judgement.given < _SMALL and not hardly_moves
+    if poses is not None and (does_not_fit() or is_small):  # are only a few sweeps wrong?
         pairs = _pairs_without_repeats(log, poses, jumps, ()) or chosen  # all may repeat the one before
         judgement = judgement if pairs == chosen else judge(make_pairs(pairs, scans, False))
         if does_not_fit():
