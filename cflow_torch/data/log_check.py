@@ -13,7 +13,7 @@ from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses, typical_sweeps
 from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, judge_log
 from cflow_torch.data.neighbours import Neighbours, middle_sweeps
-from cflow_torch.data.read_as import ReadAs, begins_late
+from cflow_torch.data.read_as import ReadAs, problem_of_columns
 from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
 from cflow_torch.diagnosis.inspection import mask_problem, repeats
 from cflow_torch.diagnosis.pair import difference
@@ -79,10 +79,8 @@ class _CheckedLog(CachedLog):
     @cached_property
     def frame(self) -> tuple[str, str]:
         """The reading that corrects the points, and what is wrong with them; both "" if nothing is."""
-        reading, problem = frame_problem(self.sweep(self.typical[0]).points)
-        if not problem and begins_late(self):
-            problem = "the first column does not seem to be x: give x, y, z first, and then others such as intensity"
-        return reading, problem
+        problem = problem_of_columns(self)
+        return ("", problem) if problem else frame_problem(self.sweep(self.typical[0]).points)
 
     @cached_property
     def tilt(self) -> str:

@@ -10,7 +10,7 @@ import torch
 from cflow_torch.config import Config
 from cflow_torch.diagnosis.conventions import INVERTED, STILL, WORLD
 from cflow_torch.diagnosis.pair import make_pair
-from cflow_torch.diagnosis.point_frame import frame_problem, tilt_problem
+from cflow_torch.diagnosis.point_frame import column_problem, frame_problem, tilt_problem
 from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, judge
 from cflow_torch.diagnosis.stillness import LEAST_SHARE, MISPLACED, are_finite, share_of_sweeps
 from cflow_torch.errors import warn
@@ -72,7 +72,7 @@ class Inspection:
         first = windows[0]
         if not self._has_seen_points:
             self._has_seen_points = True
-            problem = frame_problem(first.pc0.points)[1]
+            problem = column_problem(first.pc0.points) or frame_problem(first.pc0.points)[1]
             self._has_seen_structure = bool(problem)  # in another frame, readings of the poses mean nothing
             problem = problem or tilt_problem([first.pc0.points]) or _ground_problem(first.pc0)
             if problem:

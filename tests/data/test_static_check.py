@@ -803,17 +803,24 @@ def ring(points, axis):
     return np.arange(len(points)) % 32
 
 
-@pytest.mark.parametrize("first", [np.linalg.norm, pytest.param(ring, marks=pytest.mark.slow)])
-def test_a_column_before_x_is_told_and_no_pose_is_blamed(drive, tmp_path, first):
+@pytest.mark.parametrize(
+    ("other", "place", "found"),
+    [
+        (np.linalg.norm, 0, "2, 3 and 4"),
+        (lambda points, axis: np.random.default_rng(0).random(len(points)) ** 2, 2, "1, 2 and 4"),
+        pytest.param(ring, 0, "2, 3 and 4", marks=pytest.mark.slow),
+    ],
+)
+def test_a_column_before_x_or_z_is_told_and_no_pose_is_blamed(drive, tmp_path, other, place, found):
     write_array_log(drive, tmp_path)
     for file in (tmp_path / drive.log_id / "points").iterdir():
         points = np.load(file)
-        np.save(file, np.column_stack([first(points, axis=1), points]).astype(np.float32))
+        np.save(file, np.insert(points, place, other(points, axis=1), axis=1))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         open_log("arrays", tmp_path / drive.log_id, ground=None)
     texts = [str(each.message) for each in caught]
-    assert any("first column does not seem to be x" in text for text in texts)
+    assert any(f"x, y and z seem to be in columns {found}" in text for text in texts)
     assert not any("the poses" in text or "world's frame" in text for text in texts)
 
 

@@ -51,6 +51,18 @@ def test_wrong_ground_masks_are_told(right, mask, text):
     assert text in said
 
 
+@pytest.mark.parametrize(("place", "found"), [(0, "2, 3 and 4"), (1, "1, 3 and 4"), (2, "1, 2 and 4")])
+def test_a_column_before_z_is_told(right, place, found):
+    def with_column(sweep, place, values):
+        return replace(sweep, points=np.insert(sweep.points, place, values, axis=1))
+
+    ones = [with_column(sweep, place, 1) for sweep in (right.pc0, right.pc1)]
+    (said,) = said_of(replace(right, pc0=ones[0], pc1=ones[1]))
+    assert f"x, y and z seem to be in columns {found}" in said
+    for last in (1, np.linspace(0, 1, len(right.pc0.points))):
+        assert said_of(replace(right, pc0=with_column(right.pc0, 3, last))) == []
+
+
 def test_a_history_with_other_poses_or_in_the_reverse_order_is_told(right):
     late = [replace(sweep, pose=before.pose) for sweep, before in zip(right.pch, right.pch[1:])]
     back = [replace(sweep, pose=other.pose) for sweep, other in zip(reversed(right.pch), right.pch)]
