@@ -10,7 +10,7 @@ import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, Finding
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper, intervals_of, typical_sweeps
-from cflow_torch.data.log_motion import judge_log
+from cflow_torch.data.log_motion import judge_log, steps_of
 from cflow_torch.diagnosis.readings import Judgement
 from cflow_torch.transforms import poses_at, relative_transform, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep, as_numpy
@@ -155,9 +155,9 @@ class DeskewedLog(LogWrapper):
             return self._move_along(self.trajectory, points, seconds, index)
         before = max(index - 1, 0)
         after = min(index, len(self) - 2)
-        if before in self.gaps:  # the motion over a gap does not tell that within a sweep
+        if before in self._long_steps:  # the motion over a gap does not tell that within a sweep
             before = after
-        elif after in self.gaps:
+        elif after in self._long_steps:
             after = before
         gaps = self._gaps[[before, after]]
         if reading != "times":  # A pose interval is one turn, or several if sweeps are missing: stamps may be rounded.
@@ -201,6 +201,12 @@ class DeskewedLog(LogWrapper):
         known = self.poses
         poses = [self.log.sweep(k).pose if known is None else known[k] for k in (index, index + 1)]
         return relative_transform(poses[1], poses[0])
+
+    @cached_property
+    def _long_steps(self) -> frozenset[int]:
+        """The gaps of the log and, if sweeps have no times, the steps over which some seem to be missing."""
+        steps = steps_of(self.log) if intervals_of(self.log) is None else None
+        return self.gaps if steps is None else self.gaps.union(np.flatnonzero(steps.is_long).tolist())
 
     @cached_property
     def _gaps(self) -> np.ndarray:

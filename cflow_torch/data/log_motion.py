@@ -71,7 +71,13 @@ def choose_pairs(
     has_neighbours = (first > 0) & (second + 1 < num_sweeps)
     rows = _preferred(rows, ~np.isin(first, jumps))
     rows = _preferred(rows, has_neighbours)
-    rows = _preferred(rows, ~(np.isin(first - 1, jumps) | np.isin(second, jumps)))
+    is_cut = np.isin(first - 1, jumps) | np.isin(second, jumps)
+    if is_cut[rows].all():  # the step over missing sweeps does not tell how the sweep before it is skewed
+        length = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        long = [jump for jump in jumps if length[jump] > _LONG * np.delete(length, jumps).max(initial=_LEAST_MOTION)]
+        second = np.maximum(second - np.isin(second, long), first + 1)
+        is_cut = np.isin(first - 1, jumps) | np.isin(second, jumps)
+    rows = _preferred(rows, ~is_cut)
     first, second = first[rows], second[rows]
     turn = turn_of(_motions(poses, first, second))
     speed = np.linalg.norm(poses[second, :3, 3] - poses[first, :3, 3], axis=1) / (second - first)
@@ -252,7 +258,7 @@ class Steps(NamedTuple):
 
     given: np.ndarray  # (K-1, 4, 4), maps each sweep to the next
     usual: np.ndarray  # (K-1, 4, 4), of the median rotation and speed of the steps around it
-    longest: np.ndarray  # (K-1,) metres, of the largest speed of the steps around it
+    is_long: np.ndarray  # (K-1,) bool, longer than those around it but one, as if sweeps were missing
     excess: np.ndarray  # (K-1,) metres by which a step differs, rotations at 10 m
 
     def beyond(self, metres: float, share: float) -> list[int]:
@@ -279,8 +285,10 @@ def steps_of(log: Log) -> Steps | None:
     usual = steps[np.take_along_axis(around, middle, 1)[:, 0]]  # of the median rotation
     rates = np.where(is_step[..., None], rate[around], np.nan)
     usual[:, :3, 3] = np.nanmedian(rates, 1) * interval[:, None]
-    longest = np.nanmax(np.linalg.norm(rates, axis=2), 1) * interval
-    return Steps(steps, usual, longest, _apart(steps, usual))
+    speeds = np.sort(np.nan_to_num(np.linalg.norm(rates, axis=2)), axis=1)
+    longest = speeds[:, -2] * interval  # sweeps may be missing twice
+    is_long = np.linalg.norm(steps[:, :3, 3], axis=1) > _LONG * longest.clip(_LEAST_MOTION)
+    return Steps(steps, usual, is_long, _apart(steps, usual))
 
 
 def _apart(step: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -309,8 +317,6 @@ def find_lapses(log: Log) -> list[Lapse]:
     lapses: list[Lapse] = []
     for index in sorted(steps.beyond(_SUSPECT, _SUSPECT_SHARE)):
         given, usual = steps.given[index], steps.usual[index]
-        length = float(np.linalg.norm(given[:3, 3]))
-        is_long = index not in log.gaps and length > _LONG * max(steps.longest[index], _LEAST_MOTION)
         pair = make_pair(log.sweep(index), log.sweep(index + 1), in_world=False)
         if pair is None:
             continue
@@ -324,8 +330,8 @@ def find_lapses(log: Log) -> list[Lapse]:
                 lapses[-1] = lapses[-1]._replace(kind=POSE)  # away from, and back to the trajectory
             else:
                 lapses.append(Lapse(index + 1, float(_apart(given, fitting)), JUMP))
-        elif is_long and _is_contradicted(pair, usual, given):
-            lapses.append(Lapse(index + 1, length, MISSING))
+        elif steps.is_long[index] and index not in log.gaps and _is_contradicted(pair, usual, given):
+            lapses.append(Lapse(index + 1, float(np.linalg.norm(given[:3, 3])), MISSING))
     return lapses
 
 

@@ -388,6 +388,27 @@ def test_the_motion_over_a_gap_is_not_that_within_a_sweep(raw: Drive, truth: Dri
     assert max(largest_error(log, truth, index) for index in (2, 3, 4, 5)) < 0.05
 
 
+def test_without_times_steps_over_missing_sweeps_move_no_points() -> None:
+    kept = [0, 1, 2, 3, 5, 6, 7, 8, 9, 10, 11]
+    raw, truth = make(num_sweeps=12), make(num_sweeps=12, is_deskewed=True)
+
+    class Kept(Untimed):
+        poses = raw.poses[kept]
+
+        def __init__(self, log: Drive) -> None:
+            super().__init__(log)
+            self.timestamps = range(len(kept))
+
+        def sweep(self, index: int) -> Sweep:
+            return replace(super().sweep(kept[index]), timestamp_ns=None)
+
+    log = DeskewedLog(Kept(raw))
+    assert log.scan.startswith("clockwise")
+    for index in (3, 4):
+        moved, expected = np.asarray(log.sweep(index).points), np.asarray(truth.sweep(kept[index]).points)
+        assert np.linalg.norm(moved - expected, axis=1).max() < 0.05
+
+
 def test_a_direction_without_poses_is_said(raw: Drive) -> None:
     class Unposed(Untimed):
         poses = None
