@@ -11,7 +11,7 @@ import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses, typical_sweeps
-from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, judge_log
+from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, held_poses, judge_log
 from cflow_torch.data.neighbours import Neighbours, middle_sweeps
 from cflow_torch.data.read_as import ReadAs, problem_of_columns
 from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
@@ -101,14 +101,26 @@ class _CheckedLog(CachedLog):
 
     @cached_property
     def misfit(self) -> list[Finding]:
-        """Why neighbouring sweeps do not fit whatever the poses: they measure other directions, or alternate."""
-        parts = _parts(self)
-        return parts or ([_TWO_SENSORS] if Neighbours.of(self, middle_sweeps(self)).alternate else [])
+        """Why neighbouring sweeps do not fit: poses are held, or sweeps measure other directions, or alternate."""
+        return (
+            _held(self)
+            or _parts(self)
+            or ([_TWO_SENSORS] if Neighbours.of(self, middle_sweeps(self)).alternate else [])
+        )
 
     @cached_property
     def lapses(self) -> list[Lapse]:
         """Single wrong poses, if no other reading of all poses fits better."""
         return [] if self.motion.best else find_lapses(self)
+
+
+def _held(log: Log) -> list[Finding]:
+    held = held_poses(log)
+    if not held:
+        return []
+    text = f"{len(held)} poses repeat the one before while the vehicle moves, the first is that of sweep {held[0]}"
+    fix = "give a pose of each sweep (interpolate between those that differ), or set data.odometry=true"
+    return [Finding("poses", WRONG, f"{text}: {fix}", True)]
 
 
 _Check = Callable[[_CheckedLog], List[Finding]]

@@ -13,7 +13,7 @@ from cflow_torch.diagnosis.conventions import MARGIN, OFF, STILL, TIMES, WORLD
 from cflow_torch.diagnosis.inspection import repeats
 from cflow_torch.diagnosis.other_frame import motion_of
 from cflow_torch.diagnosis.pair import GIVEN, Pair, difference, make_pair
-from cflow_torch.diagnosis.readings import UNKNOWN, Judgement, judge
+from cflow_torch.diagnosis.readings import NO_READING, STEPS, UNKNOWN, Judgement, judge
 from cflow_torch.diagnosis.stillness import LEAST_SHARE, share_of_sweeps
 from cflow_torch.transforms import turn_of
 
@@ -34,6 +34,8 @@ _AROUND = (-3, -2, -1, 1, 2, 3)  # steps that tell it
 POSE, JUMP, MISSING = "pose", "jump", "missing"
 _OTHER = "another step"
 _AS_OTHERS = 0.75  # part of the share of the steps around, at least, under the right step
+_HELD = 0.1  # motion over that next to it, below which a pose repeats the one before
+_OF_HELD = 0.25  # least share of such poses
 _NUM_SUSPECTS = 4  # steps that are compared with the points, largest first
 _LONG = 1.7  # length of a step over all those around it, if sweeps are missing
 
@@ -151,15 +153,18 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
             if _fit_as_given(prepared, judgement):
                 again = judge(prepared)
                 judgement = again if _contradicts(again, judgement) else judgement
-    is_unclear = not judgement.best and judgement.given < _UNCLEAR
+    is_unclear = judgement.best in ((), (UNKNOWN,), (NO_READING,)) and judgement.given < _UNCLEAR
     if is_unclear and hardly_moves:
-        spread = choose_pairs(len(log.timestamps), None)
-        clouds = [[replace(log.sweep(index), pose=None) for index in pair] for pair in spread]
-        unposed = judge(make_pair(pc0, pc1) for pc0, pc1 in clouds)
-        judgement = unposed if UNKNOWN in unposed.best else judgement
+        spread = make_pairs(choose_pairs(len(log.timestamps), None), (OFF,), False)
+        of_spread = judge(_without_motion(pair) for pair in spread if pair is not None)
+        judgement = of_spread if {UNKNOWN, *STEPS}.intersection(of_spread.best) else judgement
     if STILL in judgement.best and log.unwrapped.has_viewpoints:
         return replace(judgement, shares={**judgement.shares, WORLD: judgement.shares[STILL]}, best=(WORLD,))
     return judgement
+
+
+def _without_motion(pair: Pair) -> Pair:
+    return replace(pair, transforms={**pair.transforms, GIVEN: np.eye(4)}, has_motion=False)
 
 
 def _does_not_fit(judgement: Judgement, hardly_moves: bool) -> bool:
@@ -289,6 +294,17 @@ def steps_of(log: Log) -> Steps | None:
     longest = speeds[:, -2] * interval  # sweeps may be missing twice
     is_long = np.linalg.norm(steps[:, :3, 3], axis=1) > _LONG * longest.clip(_LEAST_MOTION)
     return Steps(steps, usual, is_long, _apart(steps, usual))
+
+
+def held_poses(log: Log) -> list[int]:
+    """Return the sweeps that have about the pose of the one before, next to long steps: poses of a lower rate, held."""
+    poses = known_poses(log)
+    if poses is None or len(poses) < _FEWEST_POSES:
+        return []
+    motion = difference(_motions(poses, slice(-1), slice(1, None)), np.eye(4))
+    beside = np.maximum(np.append(motion[1:], 0), np.append(0, motion[:-1]))
+    held = (np.flatnonzero((beside > _LEAST_MOTION) & (motion < _HELD * beside)) + 1).tolist()
+    return held if len(held) >= _OF_HELD * len(poses) else []
 
 
 def _apart(step: np.ndarray, other: np.ndarray) -> np.ndarray:

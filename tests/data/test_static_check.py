@@ -879,6 +879,23 @@ def test_a_chosen_method_replaces_wrong_masks_only(drive):
     assert np.array_equal(GroundSegmentedLog(drive, "grid").sweep(3).is_ground, drive.sweep(3).is_ground)
 
 
+def test_poses_that_are_held_are_told_and_no_second_sensor(whole):
+    held = Wrong(whole, poses=lambda poses: poses[np.arange(len(poses)) // 2 * 2])
+    (text,) = [text for text in find_problems(held) if "ground masks" not in text]
+    assert "6 poses repeat the one before while the vehicle moves, the first is that of sweep 1" in text
+    assert "data.odometry=true" in text
+
+
+def test_steps_of_a_straight_fast_road_are_told(data_root):
+    hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
+    file = data_root / "kitti-raw" / "kitti-raw-0027-empty16.h5"
+    if not file.exists():
+        pytest.skip(f"needs {file.name}")
+    road = CachedLog(Thinned(hdf5.HDF5Log(file)), 16)
+    steps = Wrong(road, poses=lambda poses: np.concatenate([np.eye(4)[None], np.linalg.inv(poses[:-1]) @ poses[1:]]))
+    assert judge_log(steps).best == ("steps",)
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.6])
 def test_two_sensors_in_turns_are_told_and_nothing_else(drive, angle):
     T_points_second = np.linalg.inv(as_matrix(rotations_about(2, angle), (-1.5, 0, 0.4)))
