@@ -131,6 +131,13 @@ class Log(ABC):
         """How well readings of the poses fit, if they were compared to read the log."""
         return None
 
+    def mounting_with(self, T_poses_points: np.ndarray) -> np.ndarray:
+        """Return the setting `ego_T_lidar` under which the points are moved by more, (4, 4), from where they are read.
+
+        The setting replaces the mounting that is in use, so it contains this.
+        """
+        return T_poses_points
+
     def findings(self) -> list[Finding]:
         """Return what was found, and is used, to read the log."""
         return []

@@ -14,7 +14,7 @@ from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_po
 from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, held_poses, judge_log
 from cflow_torch.data.neighbours import Neighbours, middle_sweeps
 from cflow_torch.data.read_as import ReadAs, problem_of_columns
-from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
+from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD, Reading
 from cflow_torch.diagnosis.inspection import mask_problem, repeats
 from cflow_torch.diagnosis.pair import difference
 from cflow_torch.diagnosis.point_frame import frame_problem, tilt_problem
@@ -276,11 +276,20 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
         fix += "" if has_poses else ", unless the files are no successive sweeps of one drive, which have no flow"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
-        fix = " or ".join(judgement.reading(each).fix or _setting(log, each) for each in judgement.best)
+        fix = " or ".join(_fix_of(log, each, judgement.reading(each)) for each in judgement.best)
         fix = f"give {fix}" + (", or no poses (data.poses=null)" if name == STILL else "")
         if name in TIMES_OF_POSES and log.trajectory is not None:
             why += " the clocks of sweeps and poses may differ, because"
     return [Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)]
+
+
+def _fix_of(log: Log, name: str, reading: Reading) -> str:
+    if reading.mount is None:
+        return reading.fix or _setting(log, name)
+    ego_T_lidar = log.unwrapped.mounting_with(reading.mount)
+    more = "" if np.array_equal(ego_T_lidar, reading.mount) else " in addition to the mounting in use"
+    matrix = str((ego_T_lidar.round(3) + 0.0).tolist()).replace(" ", "")
+    return f"{reading.fix}{more}: data.ego_T_lidar={matrix} (data=arrays, hdf5 or bags)"
 
 
 def _setting(log: Log, reading: str) -> str:
