@@ -58,6 +58,10 @@ class DeskewedLog(LogWrapper):
         super().__init__(log)
         self._deskew = deskew
 
+    @property
+    def unmoved(self) -> Log:
+        return self if self.scan == "off" else self.log
+
     @cached_property
     def scan(self) -> str:
         judgement = self.judgement if self._deskew == "auto" and len(self._scans) > 1 else None

@@ -12,6 +12,7 @@ from torch.utils.data import Dataset
 
 from cflow_torch.data.camera import Camera
 from cflow_torch.data.finding import Finding
+from cflow_torch.diagnosis.inspection import repeats
 from cflow_torch.diagnosis.pair import LEAST_DISTANCE, is_around
 from cflow_torch.diagnosis.readings import Judgement
 from cflow_torch.errors import warn
@@ -243,6 +244,17 @@ class Log(ABC):
         return
 
     @property
+    def unmoved(self) -> Log:
+        """The log before its sweeps are de-skewed; the log itself if they are not."""
+        return self
+
+    def repeats(self, index: int) -> bool:
+        """Test whether sweep `index` has the points of the one before, also if both are de-skewed by other motions."""
+        if len(self.sweep(index - 1).points) != len(self.sweep(index).points):
+            return False
+        return repeats(self.unmoved.sweep(index - 1), self.unmoved.sweep(index))
+
+    @property
     def unwrapped(self) -> Log:
         """The log without its wrappers (ground, poses, cache)."""
         return self
@@ -444,6 +456,10 @@ class LogWrapper(Log):
 
     def __init__(self, log: Log) -> None:
         self.log, self.log_id, self.timestamps, self.gaps = log, log.log_id, log.timestamps, log.gaps
+
+    @property
+    def unmoved(self) -> Log:
+        return self if self.log.unmoved is self.log else self.log.unmoved
 
     def __getattr__(self, name: str) -> Any:
         if name == "log" or name.startswith("__"):  # Python asks for hooks while it unpickles, before `log` is set

@@ -15,7 +15,7 @@ from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, held_
 from cflow_torch.data.neighbours import Neighbours, middle_sweeps
 from cflow_torch.data.read_as import ReadAs, problem_of_columns
 from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD, Reading
-from cflow_torch.diagnosis.inspection import mask_problem, repeats
+from cflow_torch.diagnosis.inspection import mask_problem
 from cflow_torch.diagnosis.pair import difference
 from cflow_torch.diagnosis.point_frame import frame_problem, tilt_problem
 from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, Judgement
@@ -338,7 +338,7 @@ def _name_of(index: int) -> str:
 
 def _repeated(log: _CheckedLog) -> list[Finding]:
     first = [log.sweep(index) for index in range(2)]
-    if repeats(*first):
+    if log.repeats(1):
         text = "sweep 1 repeats the points of sweep 0: leave one out, or copy its file again"
         return [Finding("sweeps", WRONG, text, True)]
     is_known = _is_grid(first[0]) or bool(log.frame[0])  # then "to the millimetre" means nothing

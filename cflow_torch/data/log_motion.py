@@ -10,7 +10,6 @@ import numpy as np
 
 from cflow_torch.data.log import Log, known_poses, poses_beyond
 from cflow_torch.diagnosis.conventions import MARGIN, OFF, STILL, TIMES, WORLD
-from cflow_torch.diagnosis.inspection import repeats
 from cflow_torch.diagnosis.other_frame import motion_of
 from cflow_torch.diagnosis.pair import GIVEN, Pair, difference, make_pair
 from cflow_torch.diagnosis.readings import NO_READING, STEPS, UNKNOWN, Judgement, judge
@@ -200,7 +199,7 @@ def _pairs_without_repeats(
     while True:
         pairs = choose_pairs(len(log.timestamps), poses, jumps, excluded)
         sweeps = {index for pair in pairs for index in pair if index > 0}
-        repeated = {index for index in sweeps if repeats(log.sweep(index - 1), log.sweep(index))}
+        repeated = {index for index in sweeps if log.repeats(index)}
         if not repeated:
             return pairs
         excluded |= repeated

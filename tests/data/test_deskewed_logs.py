@@ -19,7 +19,8 @@ from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.finding import RIGHT
-from cflow_torch.data.log import FlowLabels, Log, LogWrapper
+from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper
+from cflow_torch.data.log_check import examine
 from cflow_torch.diagnosis.stillness import Structure, static_rows, thinned_rows
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.profiles import PROFILES
@@ -407,6 +408,20 @@ def test_without_times_steps_over_missing_sweeps_move_no_points() -> None:
     for index in (3, 4):
         moved, expected = np.asarray(log.sweep(index).points), np.asarray(truth.sweep(kept[index]).points)
         assert np.linalg.norm(moved - expected, axis=1).max() < 0.05
+
+
+def test_a_sweep_that_repeats_the_one_before_is_told_though_both_are_moved(raw: Drive) -> None:
+    class Repeated(Untimed):
+        def sweep(self, index: int) -> Sweep:
+            sweep = super().sweep(index)
+            again = replace(super().sweep(4), pose=sweep.pose, timestamp_ns=sweep.timestamp_ns)
+            return again if index == 5 else sweep
+
+    log = CachedLog(DeskewedLog(Repeated(raw), "clockwise"), 8)
+    assert [index for index in range(1, 8) if log.repeats(index)] == [5]
+    assert not np.array_equal(log.sweep(4).points, log.sweep(5).points)
+    texts = [finding.text for finding in examine(log) if finding.topic == "sweeps"]
+    assert texts[0].startswith("1 of them repeat the points of the sweep before, the first is sweep 5")
 
 
 def test_a_direction_without_poses_is_said(raw: Drive) -> None:

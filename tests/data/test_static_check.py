@@ -435,15 +435,15 @@ def test_a_rotation_and_a_place_that_fit_only_together_are_one_matrix(real):
 
 
 @pytest.mark.parametrize("reader", ["ego", "sensor", "hdf5"])
-def test_the_matrix_that_is_told_contains_the_mounting_in_use(drive, tmp_path, reader):
+def test_the_matrix_that_is_told_contains_the_mounting_in_use(whole, tmp_path, reader):
     first, more = (as_matrix(rotations_about(2, turn), (turn, 0.5, 1)) for turn in (0.3, 1.2))
     if reader == "hdf5":
         hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
-        hdf5.write_hdf5_scene(drive, tmp_path / "drive.h5")
+        hdf5.write_hdf5_scene(whole, tmp_path / "drive.h5")
         make = partial(hdf5.HDF5Log, tmp_path / "drive.h5")
     else:
-        write_array_log(drive, tmp_path)
-        make = partial(ArraysLog, tmp_path / drive.log_id, poses_of=reader)
+        write_array_log(whole, tmp_path)
+        make = partial(ArraysLog, tmp_path / whole.log_id, poses_of=reader)
     log = make(ego_T_lidar=first)
     corrected = make(ego_T_lidar=log.mounting_with(more)).sweep(2)
     expected = transform_points(log.sweep(2).points, log.sweep(2).pose @ more)
