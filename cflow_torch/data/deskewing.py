@@ -19,7 +19,8 @@ from cflow_torch.windows.deskewing import DIRECTIONS, ENDINGS, SCANS, deskew_poi
 _CHOICES = ("auto", "times", "off", *DIRECTIONS)
 _DYNAMIC = 0.05  # metres a sweep; labels of objects that move less stay static
 _SLICE = 1e-4  # seconds during which we use one pose of a trajectory: 3 mm at 30 m/s
-_INTERVAL = 0.1  # seconds between sweeps without time stamps, as models assume
+_INTERVAL = 0.1  # seconds between sweeps without time stamps, as models assume, and of a usual turn
+_LONG = 1.5  # interval between sweeps over such a turn, from which sweeps may be left out
 _INSTANTS = {"start": "the instant is the start of a turn", "end": "the instant is the end of a turn"}
 
 
@@ -38,6 +39,8 @@ class DeskewedLog(LogWrapper):
             the azimuth, see `scan_fractions`; "off" = the sweeps are compensated already; "auto" = the scan under which
             the static world stands still best (`cflow_torch.diagnosis.readings`). Without a clear one, points with
             times of raw points are moved by these, and others stay.
+        turn_seconds: duration of a turn; None = that of the reader (`Log.turn_seconds`), or the median interval. If
+            this is long, sweeps may be left out: then we compare it with a tenth of a second.
 
     Attributes:
         scan: how the sweeps are read, a value of `deskew` but "auto". It is decided at first use, by the log alone.
@@ -53,10 +56,11 @@ class DeskewedLog(LogWrapper):
           their sweeps, and divide the motion by the turns between the two measurements.
     """
 
-    def __init__(self, log: Log, deskew: str = "auto") -> None:
+    def __init__(self, log: Log, deskew: str = "auto", turn_seconds: float | None = None) -> None:
         check_deskew(deskew)
         super().__init__(log)
         self._deskew = deskew
+        self._turn_seconds = turn_seconds or log.unwrapped.turn_seconds
 
     @property
     def unmoved(self) -> Log:
@@ -221,4 +225,8 @@ class DeskewedLog(LogWrapper):
     @cached_property
     def _interval(self) -> float:
         """Seconds of one turn."""
-        return self.log.unwrapped.turn_seconds or float(np.median(self._gaps))
+        usual = float(np.median(self._gaps))
+        if self._turn_seconds or usual < _LONG * _INTERVAL or self.poses is None or self._scans[-1] not in SCANS:
+            return self._turn_seconds or usual
+        judged = {seconds: DeskewedLog(self.log, self._deskew, seconds).judgement for seconds in (usual, _INTERVAL)}
+        return max(judged, key=lambda seconds: np.nan_to_num(getattr(judged[seconds], "fits", 0)))  # ties: the interval

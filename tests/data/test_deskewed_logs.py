@@ -296,19 +296,40 @@ def test_the_command_line_takes_the_setting(raw: Drive, tmp_path: Path, capsys: 
     assert "deskew='sideways'" in capsys.readouterr().err
 
 
+class Half(Untimed):
+    """Every second sweep."""
+
+    def __init__(self, log: Drive, turn_seconds: float | None = None) -> None:
+        super().__init__(log)
+        self.timestamps = log.timestamps[1::2]
+        self.poses = log.poses[1::2]
+        self.turn_seconds = turn_seconds
+
+    def sweep(self, index: int) -> Sweep:
+        return super().sweep(2 * index + 1)
+
+
+class Slow(Untimed):
+    """Twice as slow, so that turns and intervals last 0.2 s."""
+
+    def __init__(self, log: Drive) -> None:
+        super().__init__(log)
+        self.timestamps = [2 * stamp for stamp in log.timestamps]
+
+    def sweep(self, index: int) -> Sweep:
+        return replace(super().sweep(index), timestamp_ns=self.timestamps[index])
+
+
+def test_turns_may_be_shorter_than_the_intervals_of_a_slow_log(truth: Drive, raw: Drive) -> None:
+    half = DeskewedLog(Half(make(num_sweeps=16)))
+    assert half.scan == "clockwise"
+    for log, index, true in ((half, 1, 3), (DeskewedLog(Slow(raw), "clockwise"), 3, 3)):
+        moved = np.asarray(log.sweep(index).points)
+        assert np.linalg.norm(moved - truth.sweep(true).points, axis=1).max() < 0.06
+
+
 def test_a_log_of_every_second_sweep_is_moved_by_turns_not_by_pose_intervals(raw: Drive, truth: Drive) -> None:
-    class Half(Untimed):
-        turn_seconds = 0.1
-
-        def __init__(self, log: Drive) -> None:
-            super().__init__(log)
-            self.timestamps = log.timestamps[1::2]
-            self.poses = log.poses[1::2]
-
-        def sweep(self, index: int) -> Sweep:
-            return super().sweep(2 * index + 1)
-
-    moved = np.asarray(DeskewedLog(Half(raw), "clockwise").sweep(1).points)
+    moved = np.asarray(DeskewedLog(Half(raw, 0.1), "clockwise").sweep(1).points)
     assert np.linalg.norm(moved - truth.sweep(3).points, axis=1).max() < 0.06  # chords of twice the length
 
 
