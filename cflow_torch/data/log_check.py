@@ -15,7 +15,7 @@ from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, held_
 from cflow_torch.data.neighbours import Neighbours, middle_sweeps
 from cflow_torch.data.read_as import ReadAs, problem_of_columns
 from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD, Reading
-from cflow_torch.diagnosis.inspection import mask_problem
+from cflow_torch.diagnosis.inspection import is_usual_interval, mask_problem
 from cflow_torch.diagnosis.pair import difference
 from cflow_torch.diagnosis.point_frame import frame_problem, tilt_problem
 from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, Judgement
@@ -518,7 +518,7 @@ def _times(log: Log) -> list[Finding]:
         longest = max(gaps, key=interval.__getitem__)
         text += f"; {len(gaps)} gaps, the longest of {interval[longest]:.1f} s after sweep {longest}"
         return [Finding("times", FOUND, f"{text}. No history or future of a window reaches over them")]
-    if not 0.01 <= interval.mean() <= 1:
+    if not is_usual_interval(float(interval.mean())):
         return [Finding("times", WRONG, f"{text}: are the times in the unit that the reader expects?")]
     if _change(interval) > _UNEVEN:
         text += f", and intervals change by {100 * _change(interval):.0f} % from one to the next"

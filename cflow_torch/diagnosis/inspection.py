@@ -48,6 +48,7 @@ _OTHER_TIME = (
 )
 # A share of moving points is suspicious if it is this many times larger than the usual one and a slack.
 _SUSPICIOUS, _SLACK, _FEWEST_WATCHED = 1.5, 0.05, 500
+_SHORTEST, _LONGEST = 0.002, 2.0  # seconds between sweeps; in another unit, they are at least a thousand times off
 _FEWEST_REPEATED = 100  # this many equal points are no coincidence
 
 
@@ -55,9 +56,9 @@ class Inspection:
     """Warns of likely mistakes in windows. `estimate_flow`, `FlowStream` and the integrations call it.
 
     In every window, it checks that pc1 has points, other than pc0. It makes the other checks once each, only in the
-    first window of a call. Once such a window has points, it checks units, axes, ground and missing returns. Once such
-    a window has static structure, it checks the ego motion, and whether the history fits. Cost: about 100 ms, once;
-    0.1 ms for each window.
+    first window of a call. Once such a window has points, it checks units, axes, ground, times and missing returns.
+    Once such a window has static structure, it checks the ego motion, and whether the history fits. Cost: about 100 ms,
+    once; 0.1 ms for each window.
     """
 
     def __init__(self) -> None:
@@ -77,6 +78,9 @@ class Inspection:
             problem = problem or tilt_problem([first.pc0.points]) or _ground_problem(first.pc0)
             if problem:
                 warn(problem)
+            problem = _interval_problem(first)
+            if problem:
+                warn(problem)
             _, num_missing = without_missing(first.pc0)
             if num_missing:
                 warn(f"{num_missing} {MISSING}: leave them out, or make them NaN")
@@ -87,6 +91,20 @@ class Inspection:
                 warn(f"{judgement}: {_ADVICE.get(judgement.best[0], _ADVICE_ELSE)}")
             elif first.pch and _fits_only(first.pc0, first.pc1, first.pch[0]):
                 warn(_HISTORY)
+
+
+def is_usual_interval(seconds: float) -> bool:
+    """Test whether sweeps may be so far apart, if their times have the right unit."""
+    return _SHORTEST <= seconds <= _LONGEST
+
+
+def _interval_problem(window: Window) -> str:
+    """Return what is wrong with the times of a pair; "" = nothing, or they are unknown."""
+    first, second = window.pc0.timestamp_ns, window.pc1.timestamp_ns
+    seconds = 0.1 if first is None or second is None else (second - first) * 1e-9
+    if is_usual_interval(seconds):
+        return ""
+    return f"pc1 is {seconds:.3g} s after pc0: give times in nanoseconds (int), or to FlowStream in seconds (float)"
 
 
 def _ground_problem(pc0: Sweep) -> str:
@@ -133,7 +151,9 @@ class MotionWatch:
         self._usual: float | None = None  # share of the points that moved in the pair before
 
     def __call__(self, window: Window, result: FlowResult) -> str:
-        """Return what is wrong with the next pair of the log; "" = nothing."""
+        """Return what is wrong with the next pair of the log; "" = nothing, or the result is on a GPU."""
+        if result.is_valid.device.type != "cpu":
+            return ""
         count = int(result.is_valid.sum())
         if count < _FEWEST_WATCHED:
             return ""
