@@ -13,7 +13,7 @@ import torch
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.data.odometry import Odometry
-from cflow_torch.diagnosis.inspection import Inspection
+from cflow_torch.diagnosis.inspection import Inspection, MotionWatch
 from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
 from cflow_torch.ground.segmentation import GROUND_METHODS, find_ground
@@ -80,6 +80,7 @@ class FlowStream:
         self.config = config
         self._model = make_model(config, device)
         self._inspect = Inspection()
+        self._watch = MotionWatch()
         self._ground = ground
         self._max_gap = max_gap
         self._sweeps: deque[Sweep] = deque(maxlen=config.num_history + 1)
@@ -144,6 +145,9 @@ class FlowStream:
             window = Window(before, sweep, tuple(history))
             (result,) = self._model([window])
             self._inspect([window])
+            problem = self._watch(window, result)
+            if problem:
+                warn(problem)
             self.window = window
         else:  # check it now, so that errors do not wait for the next sweep
             alone = replace(sweep, timestamp_ns=None)
@@ -161,7 +165,7 @@ class FlowStream:
             return True
         gap = (stamp - newest) / 1e9
         if -self._max_gap <= gap <= 0:
-            _log.warning("skipped a sweep: its time is %g s before that of the newest one", -gap)
+            _log.warning("skipped a sweep: its time is %g s before that of the newest one", abs(gap))
             return False
         if abs(gap) > self._max_gap:
             _log.warning("the stream starts again: %g s from one sweep to the next, more than max_gap", gap)

@@ -309,7 +309,7 @@ def open_log(
         find_ground: method of `cflow_torch.ground.find_ground` for sweeps without a ground mask, "grid" or
             "patchwork", which also replaces masks that are surely wrong; "auto" = "grid" for those without, and `check`
             warns if it found ground; None = they stay without a mask.
-        odometry: True = estimate poses from the points if the log has none; "refine" = also correct given poses.
+        odometry: True = estimate poses from the points, and ignore those that the log has; "refine" = correct these.
         check: warn of likely mistakes, see `check_log`.
         read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`; or a
             value of `deskew`: "times", "clockwise", ...

@@ -10,7 +10,7 @@ import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, Finding
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper, intervals_of, typical_sweeps
-from cflow_torch.data.log_motion import judge_log
+from cflow_torch.data.log_motion import judge_log, steps_of
 from cflow_torch.diagnosis.readings import Judgement
 from cflow_torch.transforms import poses_at, relative_transform, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep, as_numpy
@@ -19,7 +19,8 @@ from cflow_torch.windows.deskewing import DIRECTIONS, ENDINGS, SCANS, deskew_poi
 _CHOICES = ("auto", "times", "off", *DIRECTIONS)
 _DYNAMIC = 0.05  # metres a sweep; labels of objects that move less stay static
 _SLICE = 1e-4  # seconds during which we use one pose of a trajectory: 3 mm at 30 m/s
-_INTERVAL = 0.1  # seconds between sweeps without time stamps, as models assume
+_INTERVAL = 0.1  # seconds between sweeps without time stamps, as models assume, and of a usual turn
+_LONG = 1.5  # interval between sweeps over such a turn, from which sweeps may be left out
 _INSTANTS = {"start": "the instant is the start of a turn", "end": "the instant is the end of a turn"}
 
 
@@ -38,6 +39,8 @@ class DeskewedLog(LogWrapper):
             the azimuth, see `scan_fractions`; "off" = the sweeps are compensated already; "auto" = the scan under which
             the static world stands still best (`cflow_torch.diagnosis.readings`). Without a clear one, points with
             times of raw points are moved by these, and others stay.
+        turn_seconds: duration of a turn; None = that of the reader (`Log.turn_seconds`), or the median interval. If
+            this is long, sweeps may be left out: then we compare it with a tenth of a second.
 
     Attributes:
         scan: how the sweeps are read, a value of `deskew` but "auto". It is decided at first use, by the log alone.
@@ -53,10 +56,15 @@ class DeskewedLog(LogWrapper):
           their sweeps, and divide the motion by the turns between the two measurements.
     """
 
-    def __init__(self, log: Log, deskew: str = "auto") -> None:
+    def __init__(self, log: Log, deskew: str = "auto", turn_seconds: float | None = None) -> None:
         check_deskew(deskew)
         super().__init__(log)
         self._deskew = deskew
+        self._turn_seconds = turn_seconds or log.unwrapped.turn_seconds
+
+    @property
+    def unmoved(self) -> Log:
+        return self if self.scan == "off" else self.log
 
     @cached_property
     def scan(self) -> str:
@@ -153,9 +161,9 @@ class DeskewedLog(LogWrapper):
             return self._move_along(self.trajectory, points, seconds, index)
         before = max(index - 1, 0)
         after = min(index, len(self) - 2)
-        if before in self.gaps:  # the motion over a gap does not tell that within a sweep
+        if before in self._long_steps:  # the motion over a gap does not tell that within a sweep
             before = after
-        elif after in self.gaps:
+        elif after in self._long_steps:
             after = before
         gaps = self._gaps[[before, after]]
         if reading != "times":  # A pose interval is one turn, or several if sweeps are missing: stamps may be rounded.
@@ -201,6 +209,12 @@ class DeskewedLog(LogWrapper):
         return relative_transform(poses[1], poses[0])
 
     @cached_property
+    def _long_steps(self) -> frozenset[int]:
+        """The gaps of the log and, if sweeps have no times, the steps over which some seem to be missing."""
+        steps = steps_of(self.log) if intervals_of(self.log) is None else None
+        return self.gaps if steps is None else self.gaps.union(np.flatnonzero(steps.is_long).tolist())
+
+    @cached_property
     def _gaps(self) -> np.ndarray:
         """(K-1,) float64 seconds from each sweep to the next."""
         known = intervals_of(self.log)
@@ -209,4 +223,8 @@ class DeskewedLog(LogWrapper):
     @cached_property
     def _interval(self) -> float:
         """Seconds of one turn."""
-        return self.log.unwrapped.turn_seconds or float(np.median(self._gaps))
+        usual = float(np.median(self._gaps))
+        if self._turn_seconds or usual < _LONG * _INTERVAL or self.poses is None or self._scans[-1] not in SCANS:
+            return self._turn_seconds or usual
+        judged = {seconds: DeskewedLog(self.log, self._deskew, seconds).judgement for seconds in (usual, _INTERVAL)}
+        return max(judged, key=lambda seconds: np.nan_to_num(getattr(judged[seconds], "fits", 0)))  # ties: the interval

@@ -13,6 +13,7 @@ from torch.utils.data import Dataset
 from cflow_torch.data.camera import Camera
 from cflow_torch.data.finding import Finding
 from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
+from cflow_torch.diagnosis.inspection import repeats
 from cflow_torch.diagnosis.pair import LEAST_DISTANCE, is_around
 from cflow_torch.diagnosis.readings import Judgement
 from cflow_torch.errors import warn
@@ -132,6 +133,13 @@ class Log(ABC):
         """How well readings of the poses fit, if they were compared to read the log."""
         return None
 
+    def mounting_with(self, T_poses_points: np.ndarray) -> np.ndarray:
+        """Return the setting `ego_T_lidar` under which the points are moved by more, (4, 4), from where they are read.
+
+        The setting replaces the mounting that is in use, so it contains this.
+        """
+        return T_poses_points
+
     def findings(self) -> list[Finding]:
         """Return what was found, and is used, to read the log."""
         return []
@@ -235,6 +243,17 @@ class Log(ABC):
     def close(self) -> None:
         """Close the files that the log holds open."""
         return
+
+    @property
+    def unmoved(self) -> Log:
+        """The log before its sweeps are de-skewed; the log itself if they are not."""
+        return self
+
+    def repeats(self, index: int) -> bool:
+        """Test whether sweep `index` has the points of the one before, also if both are de-skewed by other motions."""
+        if len(self.sweep(index - 1).points) != len(self.sweep(index).points):
+            return False
+        return repeats(self.unmoved.sweep(index - 1), self.unmoved.sweep(index))
 
     @property
     def unwrapped(self) -> Log:
@@ -449,6 +468,10 @@ class LogWrapper(Log):
 
     def __init__(self, log: Log) -> None:
         self.log, self.log_id, self.timestamps, self.gaps = log, log.log_id, log.timestamps, log.gaps
+
+    @property
+    def unmoved(self) -> Log:
+        return self if self.log.unmoved is self.log else self.log.unmoved
 
     def __getattr__(self, name: str) -> Any:
         if name == "log" or name.startswith("__"):  # Python asks for hooks while it unpickles, before `log` is set

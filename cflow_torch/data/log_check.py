@@ -12,11 +12,11 @@ import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses, typical_sweeps
-from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, judge_log
+from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, held_poses, judge_log
 from cflow_torch.data.neighbours import Neighbours
-from cflow_torch.data.read_as import ReadAs, begins_late
-from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
-from cflow_torch.diagnosis.inspection import mask_problem, repeats
+from cflow_torch.data.read_as import ReadAs, problem_of_columns
+from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD, Reading
+from cflow_torch.diagnosis.inspection import is_usual_interval, mask_problem
 from cflow_torch.diagnosis.pair import difference
 from cflow_torch.diagnosis.point_frame import frame_problem, tilt_problem
 from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, Judgement
@@ -81,10 +81,8 @@ class _CheckedLog(CachedLog):
     @cached_property
     def frame(self) -> tuple[str, str]:
         """The reading that corrects the points, and what is wrong with them; both "" if nothing is."""
-        reading, problem = frame_problem(self.sweep(self.typical[0]).points)
-        if not problem and begins_late(self):
-            problem = "the first column does not seem to be x: give x, y, z first, and then others such as intensity"
-        return reading, problem
+        problem = problem_of_columns(self)
+        return ("", problem) if problem else frame_problem(self.sweep(self.typical[0]).points)
 
     @cached_property
     def tilt(self) -> str:
@@ -105,16 +103,25 @@ class _CheckedLog(CachedLog):
 
     @cached_property
     def misfit(self) -> list[Finding]:
-        """Why neighbouring sweeps do not fit whatever the poses: they measure other directions, or alternate."""
+        """Why neighbouring sweeps do not fit: poses are held, or sweeps measure other directions, or alternate."""
         count = min(_ALTERNATING, len(self))
         first = (len(self) - count) // 2
         middle = range(first, first + count)
-        return _parts(self) or ([_TWO_SENSORS] if Neighbours.of(self, middle).alternate else [])
+        return _held(self) or _parts(self) or ([_TWO_SENSORS] if Neighbours.of(self, middle).alternate else [])
 
     @cached_property
     def lapses(self) -> list[Lapse]:
         """Single wrong poses, if no other reading of all poses fits better."""
         return [] if self.motion.best else find_lapses(self)
+
+
+def _held(log: Log) -> list[Finding]:
+    held = held_poses(log)
+    if not held:
+        return []
+    text = f"{len(held)} poses repeat the one before while the vehicle moves, the first is that of sweep {held[0]}"
+    fix = "give a pose of each sweep (interpolate between those that differ), or set data.odometry=true"
+    return [Finding("poses", WRONG, f"{text}: {fix}", True)]
 
 
 _Check = Callable[[_CheckedLog], List[Finding]]
@@ -262,11 +269,20 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
         fix += "" if has_poses else ", unless the files are no successive sweeps of one drive, which have no flow"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
-        fix = " or ".join(judgement.reading(each).fix or _setting(log, each) for each in judgement.best)
+        fix = " or ".join(_fix_of(log, each, judgement.reading(each)) for each in judgement.best)
         fix = f"give {fix}" + (", or no poses (data.poses=null)" if name == STILL else "")
         if name in TIMES_OF_POSES and log.trajectory is not None:
             why += " the clocks of sweeps and poses may differ, because"
     return [Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)]
+
+
+def _fix_of(log: Log, name: str, reading: Reading) -> str:
+    if reading.mount is None:
+        return reading.fix or _setting(log, name)
+    ego_T_lidar = log.unwrapped.mounting_with(reading.mount)
+    more = "" if np.array_equal(ego_T_lidar, reading.mount) else " in addition to the mounting in use"
+    matrix = str((ego_T_lidar.round(3) + 0.0).tolist()).replace(" ", "")
+    return f"{reading.fix}{more}: data.ego_T_lidar={matrix} (data=arrays, hdf5 or bags)"
 
 
 def _setting(log: Log, reading: str) -> str:
@@ -316,7 +332,7 @@ def _name_of(index: int) -> str:
 
 def _repeated(log: _CheckedLog) -> list[Finding]:
     first = [log.sweep(index) for index in range(2)]
-    if repeats(*first):
+    if log.repeats(1):
         text = "sweep 1 repeats the points of sweep 0: leave one out, or copy its file again"
         return [Finding("sweeps", WRONG, text, True)]
     spacing = _spacing_of_grid(first[0])
@@ -497,7 +513,7 @@ def _times(log: Log) -> list[Finding]:
         longest = max(gaps, key=interval.__getitem__)
         text += f"; {len(gaps)} gaps, the longest of {interval[longest]:.1f} s after sweep {longest}"
         return [Finding("times", FOUND, f"{text}. No history or future of a window reaches over them")]
-    if not 0.01 <= interval.mean() <= 1:
+    if not is_usual_interval(float(interval.mean())):
         return [Finding("times", WRONG, f"{text}: are the times in the unit that the reader expects?")]
     if _change(interval) > _UNEVEN:
         text += f", and intervals change by {100 * _change(interval):.0f} % from one to the next"

@@ -10,10 +10,9 @@ import numpy as np
 
 from cflow_torch.data.log import Log, known_poses, poses_beyond
 from cflow_torch.diagnosis.conventions import EQUAL, MARGIN, OFF, STILL, TIMES, WORLD
-from cflow_torch.diagnosis.inspection import repeats
 from cflow_torch.diagnosis.other_frame import motion_of
 from cflow_torch.diagnosis.pair import GIVEN, Pair, difference, make_pair
-from cflow_torch.diagnosis.readings import UNKNOWN, Judgement, judge
+from cflow_torch.diagnosis.readings import NO_READING, STEPS, UNKNOWN, Judgement, judge
 from cflow_torch.diagnosis.stillness import LEAST_SHARE, share_of_sweeps
 from cflow_torch.transforms import turn_of
 
@@ -35,6 +34,8 @@ _AROUND = (-3, -2, -1, 1, 2, 3)  # steps that tell it
 POSE, JUMP, MISSING = "pose", "jump", "missing"
 _OTHER = "another step"
 _AS_OTHERS = 0.75  # part of the share of the steps around, at least, under the right step
+_HELD = 0.1  # motion over that next to it, below which a pose repeats the one before
+_OF_HELD = 0.25  # least share of such poses
 _NUM_SUSPECTS = 4  # steps that are compared with the points, largest first
 _LONG = 1.7  # length of a step over all those around it, if sweeps are missing
 
@@ -72,7 +73,13 @@ def choose_pairs(
     has_neighbours = (first > 0) & (second + 1 < num_sweeps)
     rows = _preferred(rows, ~np.isin(first, jumps))
     rows = _preferred(rows, has_neighbours)
-    rows = _preferred(rows, ~(np.isin(first - 1, jumps) | np.isin(second, jumps)))
+    is_cut = np.isin(first - 1, jumps) | np.isin(second, jumps)
+    if is_cut[rows].all():  # the step over missing sweeps does not tell how the sweep before it is skewed
+        length = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        long = [jump for jump in jumps if length[jump] > _LONG * np.delete(length, jumps).max(initial=_LEAST_MOTION)]
+        second = np.maximum(second - np.isin(second, long), first + 1)
+        is_cut = np.isin(first - 1, jumps) | np.isin(second, jumps)
+    rows = _preferred(rows, ~is_cut)
     first, second = first[rows], second[rows]
     turn = turn_of(_motions(poses, first, second))
     speed = np.linalg.norm(poses[second, :3, 3] - poses[first, :3, 3], axis=1) / (second - first)
@@ -154,14 +161,18 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
             others = _pairs_without_repeats(log, poses, jumps, {index for pair in pairs for index in pair})
             again = judge(make_pairs(others, scans, False))
             judgement = again if _contradicts(again, judgement) else judgement.confirmed_by(again)
-    if hardly_moves and not judgement.best and judgement.given < _UNCLEAR:
-        spread = choose_pairs(len(log.timestamps), None)
-        clouds = [[replace(log.sweep(index), pose=None) for index in pair] for pair in spread]
-        unposed = judge(make_pair(pc0, pc1) for pc0, pc1 in clouds)
-        judgement = unposed if UNKNOWN in unposed.best else judgement
+    is_unclear = judgement.best in ((), (UNKNOWN,), (NO_READING,)) and judgement.given < _UNCLEAR
+    if is_unclear and hardly_moves:
+        spread = make_pairs(choose_pairs(len(log.timestamps), None), (OFF,), False)
+        of_spread = judge(_without_motion(pair) for pair in spread if pair is not None)
+        judgement = of_spread if {UNKNOWN, *STEPS}.intersection(of_spread.best) else judgement
     if STILL in judgement.best and log.unwrapped.has_viewpoints:
         return replace(judgement, shares={**judgement.shares, WORLD: judgement.shares[STILL]}, best=(WORLD,))
     return judgement
+
+
+def _without_motion(pair: Pair) -> Pair:
+    return replace(pair, transforms={**pair.transforms, GIVEN: np.eye(4)}, has_motion=False)
 
 
 def _contradicts(again: Judgement, judgement: Judgement) -> bool:
@@ -195,7 +206,7 @@ def _pairs_without_repeats(
     while True:
         pairs = choose_pairs(len(log.timestamps), poses, jumps, excluded)
         sweeps = {index for pair in pairs for index in pair if index > 0}
-        repeated = {index for index in sweeps if repeats(log.sweep(index - 1), log.sweep(index))}
+        repeated = {index for index in sweeps if log.repeats(index)}
         if not repeated:
             return pairs
         excluded |= repeated
@@ -234,7 +245,7 @@ class Steps(NamedTuple):
 
     given: np.ndarray  # (K-1, 4, 4), maps each sweep to the next
     usual: np.ndarray  # (K-1, 4, 4), of the median rotation and speed of the steps around it
-    longest: np.ndarray  # (K-1,) metres, of the largest speed of the steps around it
+    is_long: np.ndarray  # (K-1,) bool, longer than those around it but one, as if sweeps were missing
     excess: np.ndarray  # (K-1,) metres by which a step differs, rotations at 10 m
 
     def beyond(self, metres: float, share: float) -> list[int]:
@@ -261,8 +272,21 @@ def steps_of(log: Log) -> Steps | None:
     usual = steps[np.take_along_axis(around, middle, 1)[:, 0]]  # of the median rotation
     rates = np.where(is_step[..., None], rate[around], np.nan)
     usual[:, :3, 3] = np.nanmedian(rates, 1) * interval[:, None]
-    longest = np.nanmax(np.linalg.norm(rates, axis=2), 1) * interval
-    return Steps(steps, usual, longest, _apart(steps, usual))
+    speeds = np.sort(np.nan_to_num(np.linalg.norm(rates, axis=2)), axis=1)
+    longest = speeds[:, -2] * interval  # sweeps may be missing twice
+    is_long = np.linalg.norm(steps[:, :3, 3], axis=1) > _LONG * longest.clip(_LEAST_MOTION)
+    return Steps(steps, usual, is_long, _apart(steps, usual))
+
+
+def held_poses(log: Log) -> list[int]:
+    """Return the sweeps that have about the pose of the one before, next to long steps: poses of a lower rate, held."""
+    poses = known_poses(log)
+    if poses is None or len(poses) < _FEWEST_POSES:
+        return []
+    motion = difference(_motions(poses, slice(-1), slice(1, None)), np.eye(4))
+    beside = np.maximum(np.append(motion[1:], 0), np.append(0, motion[:-1]))
+    held = (np.flatnonzero((beside > _LEAST_MOTION) & (motion < _HELD * beside)) + 1).tolist()
+    return held if len(held) >= _OF_HELD * len(poses) else []
 
 
 def _apart(step: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -291,8 +315,6 @@ def find_lapses(log: Log) -> list[Lapse]:
     lapses: list[Lapse] = []
     for index in sorted(steps.beyond(_SUSPECT, _SUSPECT_SHARE)):
         given, usual = steps.given[index], steps.usual[index]
-        length = float(np.linalg.norm(given[:3, 3]))
-        is_long = index not in log.gaps and length > _LONG * max(steps.longest[index], _LEAST_MOTION)
         pair = make_pair(log.sweep(index), log.sweep(index + 1), in_world=False)
         if pair is None:
             continue
@@ -306,8 +328,8 @@ def find_lapses(log: Log) -> list[Lapse]:
                 lapses[-1] = lapses[-1]._replace(kind=POSE)  # away from, and back to the trajectory
             else:
                 lapses.append(Lapse(index + 1, float(_apart(given, fitting)), JUMP))
-        elif is_long and _is_contradicted(pair, usual, given):
-            lapses.append(Lapse(index + 1, length, MISSING))
+        elif steps.is_long[index] and index not in log.gaps and _is_contradicted(pair, usual, given):
+            lapses.append(Lapse(index + 1, float(np.linalg.norm(given[:3, 3])), MISSING))
     return lapses
 
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from cflow_torch.data.log import Log
-from cflow_torch.diagnosis.inspection import repeats
 from cflow_torch.diagnosis.stillness import (
     LEAST_SHARE,
     MISPLACED,
@@ -50,7 +49,7 @@ class Neighbours(NamedTuple):
                 result.errors[index] = error
             for shares, other in zip((result.shares, result.shares_of_second), before):
                 shares.append(share_in_place(*other, sweep, structure))
-            if before and before[0][0] is not None and sweep is not None and repeats(before[0][0], sweep):
+            if before and before[0][0] is not None and sweep is not None and log.repeats(index):
                 result.repeated.append(index)
             before = [(sweep, structure), *before[:1]]
         return result

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from cflow_torch.data.log import Log, LogWrapper, known_poses
+from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.transforms import relative_transform, rigid_transform
 from cflow_torch.types import Sweep
@@ -81,17 +81,22 @@ class Odometry:
         return self._pose.copy()
 
 
-def estimate_poses(log: Log) -> np.ndarray:
+def estimate_poses(log: Log, starts_from_poses: bool = True) -> np.ndarray:
     """Estimate (K, 4, 4) float64 `T_world_ego` of the sweeps of a log; the world is the ego frame of the first.
 
-    If the sweeps have poses, each alignment starts from the motion between them. Cost: reads all sweeps.
+    If the sweeps have poses, each alignment starts from the motion between them, unless you say that they are wrong.
+    Cost: reads all sweeps.
     """
     odometry = Odometry()
     poses = []
     given: Any = None  # pose of the sweep before
     for index in tqdm(range(len(log.timestamps)), desc="odometry", unit="sweep", disable=None):
         sweep = log.sweep(index)
-        start = None if given is None or sweep.pose is None else relative_transform(sweep.pose, given)
+        start = (
+            None
+            if given is None or sweep.pose is None or not starts_from_poses
+            else relative_transform(sweep.pose, given)
+        )
         poses.append(odometry.next_pose(np.asarray(sweep.points), f"sweep {index} of log {log.log_id}", start))
         given = sweep.pose
     return np.stack(poses)
@@ -111,6 +116,5 @@ class PosedLog(LogWrapper):
 
 
 def with_poses(log: Log, refine: bool = False) -> Log:
-    """Return a log with `estimate_poses`, or the log itself if its sweeps have poses that are not to be refined."""
-    has_poses = log.sweep(0).pose is not None and (log.poses is None or known_poses(log) is not None)
-    return log if has_poses and not refine else PosedLog(log, estimate_poses(log), are_estimated=True)
+    """Return a log with `estimate_poses`. Poses that it has are replaced; with `refine`, they are where we start."""
+    return PosedLog(log, estimate_poses(log, refine), are_estimated=True)

@@ -8,19 +8,20 @@ from typing import Any, Sequence
 
 import numpy as np
 
+from cflow_torch.data.column_names import default_names
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper, known_poses, poses_beyond, typical_sweeps
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.data.odometry import PosedLog
 from cflow_torch.diagnosis.conventions import LATEST, OF_POINTS, READINGS, REVERSED, TIMES_OF_POSES, WORLD
+from cflow_torch.diagnosis.point_frame import column_problem
 from cflow_torch.diagnosis.readings import STEPS
 from cflow_torch.errors import CFlowError
-from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
 
-_LEAST_HEIGHT = 0.5  # metres that nine tenths of the heights span, if they are heights
 _COARSEST = 0.01  # metres between two float32 coordinates
+_UNNAMED = default_names(5)[3:]  # columns after the first three, two of which may be y and z
 READ_AS = ("auto", None, *READINGS)
 
 
@@ -66,22 +67,17 @@ def _is_in_world(log: Log) -> bool:
     try:
         if not (log.unwrapped.has_viewpoints or log.surrounds_poses) or WORLD not in judge_log(log).best:
             return False
-        return not begins_late(log)
+        return not problem_of_columns(log)
     except (CFlowError, OSError):
         return False  # `sweep` raises the error
 
 
-def begins_late(log: Log) -> bool:
-    """Test whether clouds have another column before x, y and z: the second to fourth have ground, the others none."""
+def problem_of_columns(log: Log) -> str:
+    """Return which columns of a typical sweep seem to be x, y and z, if others than the first three do."""
     index = typical_sweeps(log)[0]
-    columns = as_numpy(log.sweep(index).points)[:, :3]
-    known = columns[np.isfinite(columns[:, 0]), 0]
-    if not len(known) or known.min() < 0 or has_ground(columns):
-        return False
-    fourth = log.columns(index).get("column_3", np.zeros(0))
-    if len(fourth) != len(columns) or np.ptp(np.quantile(fourth, (0.05, 0.95))) < _LEAST_HEIGHT:
-        return False
-    return has_ground(np.column_stack([columns[:, 1:], fourth]).astype(np.float32))
+    points = as_numpy(log.sweep(index).points)[:, :3]
+    others = [values for name, values in log.columns(index).items() if name in _UNNAMED]
+    return column_problem(np.column_stack([points, *(each for each in others if len(each) == len(points))]))
 
 
 class ReadAs(LogWrapper):

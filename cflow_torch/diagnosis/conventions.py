@@ -60,6 +60,7 @@ class Reading(NamedTuple):
     margin: float = MARGIN
     opposite: str = ""  # the opposite mistake: if this reading is right, the opposite one doubles the mistake
     fix: str = ""  # what corrects it; "" = the value of `read_as` with its name
+    mount: np.ndarray | None = None  # (4, 4), from the frame of the points to that of the poses, if this corrects it
 
 
 def scale_poses(unit: float, poses: np.ndarray) -> np.ndarray:

@@ -84,9 +84,8 @@ def mounting(rotation: np.ndarray, place: np.ndarray) -> Reading:
         named = [f"{axis} = {value:.1f} m" for axis, value in zip("xyz", place) if axis != "z" or abs(value) > 0.05]
         causes.append(f"the points' origin is at about {' and '.join(named)} in the frame of the poses")
         fixes.append(f"a position of about {' and '.join(named)}")
-    matrix = str((as_matrix(told, place).round(3) + 0.0).tolist()).replace(" ", "")
-    fix = f"{where} {' and '.join(fixes)}: data.ego_T_lidar={matrix} (data=arrays, hdf5 or bags)"
-    return Reading(", and ".join(causes), partial(_seen_from, as_matrix(rotation, place)), fix=fix)
+    seen_from = partial(_seen_from, as_matrix(rotation, place))
+    return Reading(", and ".join(causes), seen_from, fix=f"{where} {' and '.join(fixes)}", mount=as_matrix(told, place))
 
 
 def _direction(axis: np.ndarray) -> str:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import Iterable
 
 import numpy as np
 
 from cflow_torch.diagnosis.conventions import READINGS, UNITS
+from cflow_torch.diagnosis.stillness import cell_keys
 from cflow_torch.ground.segmentation import find_ground, ground_side, has_ground
 from cflow_torch.transforms import rotations_about
 from cflow_torch.types import Array, as_numpy
@@ -32,6 +34,12 @@ _LEAST_TILT = 5.0  # degrees; roads rise by less within 30 m
 # Part of the tilt by which one sweep may differ from others, and share of the sweeps that must not: robots and people
 # tilt a sensor for a moment, and indoors other surfaces may be taken for ground.
 _TILT_APART, _AGREEING = 0.5, 0.75
+# Most cells of the plane show one surface, so heights differ by less there than this part of their extent: in 0.32 of
+# the cells and more, but those of random numbers in 0.02. Intensities from 0 to 1 have no extent, and those of a byte,
+# as rings, have few values.
+_SIDE, _FEWEST_IN_CELL, _APART, _LEAST_SMOOTH = 0.5, 5, 0.1, 0.2
+_LEAST_HEIGHT, _OF_A_BYTE = 1.0, 256
+_MOST_COLUMNS = 5
 
 
 def frame_problem(points: Array) -> tuple[str, str]:
@@ -75,6 +83,45 @@ def frame_problem(points: Array) -> tuple[str, str]:
         if _has_ground_as(reading, positions):
             return reading, f"the points seem to have {axes}: {_UP}"
     return "", ""
+
+
+def column_problem(columns: Array) -> str:
+    """Return which columns of a sweep, (N, C), seem to be x, y and z, among five; "" = the first three, or unknown.
+
+    Together, they have ground, and heights that are alike nearby. Cost: 10 ms; 0.1 s if the first three have not.
+    """
+    if columns.shape[1] < 4 or len(columns) < _FEWEST:
+        return ""
+    step = len(columns) // _MOST_POINTS + 1
+    table = as_numpy(columns[::step])[:, :_MOST_COLUMNS].astype(np.float64)
+    table = table[np.isfinite(table).all(axis=1)]
+    if _smoothness(table[:, :3]) > _LEAST_SMOOTH:
+        return ""
+    known = [k for k, column in enumerate(table.T) if len(np.unique(column)) > _OF_A_BYTE]
+    chosen = [three for three in combinations(known, 3) if _smoothness(table[:, three]) > _LEAST_SMOOTH]
+    if not chosen:
+        return ""
+    lowest = table.min(axis=0)  # a range, which may look like x or y, is never negative
+    found = max(chosen, key=lambda three: (lowest[[*three[:2]]] < 0).sum())  # ties: the first
+    named = "{}, {} and {}".format(*(k + 1 for k in found))
+    return f"x, y and z seem to be in columns {named}: give these three first, and then others such as intensity"
+
+
+def _smoothness(positions: np.ndarray) -> float:
+    """Return the share of the cells in which points, (N, 3) float64, show one surface; 0 = they have no ground."""
+    positions = positions[(np.abs(positions) < _WIDE).all(axis=1)]
+    if len(positions) < _FEWEST:
+        return 0.0
+    low, high = np.quantile(positions[:, 2], (0.05, 0.95))
+    if high - low < _LEAST_HEIGHT or not has_ground(positions):
+        return 0.0
+    cell = cell_keys(np.floor(positions * (1, 1, 0) / _SIDE).astype(np.int64))
+    order = np.lexsort((positions[:, 2], cell))
+    _, start, count = np.unique(cell[order], return_index=True, return_counts=True)
+    start, count = start[count >= _FEWEST_IN_CELL], count[count >= _FEWEST_IN_CELL]
+    height = positions[order, 2]
+    apart = height[start + count * 3 // 4] - height[start + count // 4]
+    return float((apart < _APART * (high - low)).mean()) if len(apart) else 0.0
 
 
 def tilt_problem(sweeps: Iterable[Array]) -> str:

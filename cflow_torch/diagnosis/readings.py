@@ -336,7 +336,7 @@ def _best_of(pairs: Sequence[Pair], expected: str, others: Sequence[str]) -> tup
         of_pairs = [{**pair.shares_of_scans(starts), **each} for pair, each in zip(pairs, of_pairs)]
         of_starts, clear = _compare(of_pairs, expected, LEAST_SHARE / 2)
         _, better = _compare([{start: each[start] for start in starts} for each in of_pairs], best)
-        clear = clear[:1] if best not in clear else [*better, best]
+        clear = [*better, best] if clear else []
         shares.update({scan: of_starts[scan] for scan in clear[:1]})
     if not clear:
         return expected, shares

@@ -21,7 +21,7 @@ from cflow_torch.data.flow_file import POINTS, write_flow
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.log_check import find_problems
 from cflow_torch.data.paths import as_path, safe_name
-from cflow_torch.diagnosis.inspection import MotionWatch, inactive_problems, pair_problem
+from cflow_torch.diagnosis.inspection import REPEATED, MotionWatch, inactive_problems, pair_problem
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.executors import describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, frame_name
@@ -146,7 +146,7 @@ class Worker:
         frame = _Frame(int(log.timestamps[index]))
         with _stage(frame, "read"):
             frame.content = sweeps = window(log, index, self._job.config.num_history, self._job.config.num_future)
-            frame.problem = pair_problem(sweeps.pc0, sweeps.pc1)
+            frame.problem = pair_problem(sweeps.pc0, sweeps.pc1) or (REPEATED if log.repeats(index + 1) else "")
         return frame
 
     def _compute(self, frames: list[_Frame]) -> list[_Frame]:

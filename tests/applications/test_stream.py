@@ -20,6 +20,8 @@ from small_logs import make_small_drive
 
 from cflow_torch import CFlowError, FlowResult, FlowStream, Sweep, Window, make_config, make_model
 from cflow_torch.errors import CFlowWarning
+from cflow_torch.simulator import make_drive
+from cflow_torch.transforms import as_matrix
 
 
 @pytest.fixture(scope="module")
@@ -191,3 +193,27 @@ def test_the_command_reports_latency(tmp_path, capsys):
     assert not (tmp_path / "none" / "stream.json").exists()
     assert report["sweeps"] == 4 and report["results"] == 3 and report["in_time"] is None
     assert 0 < report["latency"]["p50"] <= report["latency"]["p99"] and "latency: median" in capsys.readouterr().out
+
+
+def shifted(poses):
+    """Poses that jump to the left by a metre before the last sweep."""
+    return [*poses[:-1], as_matrix(np.eye(3), (0, 1, 0)) @ poses[-1]]
+
+
+@pytest.mark.parametrize(
+    ("poses", "unit", "text"),
+    [
+        (list, 1, ""),
+        (list, 1000, "pc1 is 0.0001 s after pc0: give times in nanoseconds"),
+        (shifted, 1, "the second sweep does not fit the first one"),
+    ],
+)
+def test_times_and_poses_of_later_sweeps_are_checked(poses, unit, text):
+    drive = make_drive(seed=2, num_sweeps=4, profile="demo", scene="narrow")
+    stream = FlowStream("default", num_history=1, pixel_sizes=(0.8, 0.4))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for sweep, pose in zip(drive, poses(drive.poses)):
+            push(stream, sweep, pose=pose, timestamp_ns=sweep.timestamp_ns // unit)
+    said = [str(each.message) for each in caught]
+    assert len(said) == bool(text) and all(text in each for each in said)

@@ -143,6 +143,7 @@ def test_a_missing_link_is_named(tmp_path) -> None:
     assert np.allclose(assumed.poses[3], bag.recording.pose_at(assumed.timestamps[3]))
     log = BagLog(path, ego_T_lidar=MOUNT)
     assert log.frame == "base_link" and world(log, bag.recording) < 5e-3
+    assert np.allclose(log.mounting_with(MOUNT), MOUNT @ MOUNT), "the setting replaces the mounting in use"
 
 
 def test_a_bag_next_to_one_without_poses_is_named_if_it_has_some(tmp_path, recwarn) -> None:

@@ -19,7 +19,8 @@ from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.finding import RIGHT
-from cflow_torch.data.log import FlowLabels, Log, LogWrapper
+from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper
+from cflow_torch.data.log_check import examine
 from cflow_torch.diagnosis.stillness import Structure, static_rows, thinned_rows
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.profiles import PROFILES
@@ -321,19 +322,40 @@ def test_the_command_line_takes_the_setting(raw: Drive, tmp_path: Path, capsys: 
     assert "deskew='sideways'" in capsys.readouterr().err
 
 
+class Half(Untimed):
+    """Every second sweep."""
+
+    def __init__(self, log: Drive, turn_seconds: float | None = None) -> None:
+        super().__init__(log)
+        self.timestamps = log.timestamps[1::2]
+        self.poses = log.poses[1::2]
+        self.turn_seconds = turn_seconds
+
+    def sweep(self, index: int) -> Sweep:
+        return super().sweep(2 * index + 1)
+
+
+class Slow(Untimed):
+    """Twice as slow, so that turns and intervals last 0.2 s."""
+
+    def __init__(self, log: Drive) -> None:
+        super().__init__(log)
+        self.timestamps = [2 * stamp for stamp in log.timestamps]
+
+    def sweep(self, index: int) -> Sweep:
+        return replace(super().sweep(index), timestamp_ns=self.timestamps[index])
+
+
+def test_turns_may_be_shorter_than_the_intervals_of_a_slow_log(truth: Drive, raw: Drive) -> None:
+    half = DeskewedLog(Half(make(num_sweeps=16)))
+    assert half.scan == "clockwise"
+    for log, index, true in ((half, 1, 3), (DeskewedLog(Slow(raw), "clockwise"), 3, 3)):
+        moved = np.asarray(log.sweep(index).points)
+        assert np.linalg.norm(moved - truth.sweep(true).points, axis=1).max() < 0.06
+
+
 def test_a_log_of_every_second_sweep_is_moved_by_turns_not_by_pose_intervals(raw: Drive, truth: Drive) -> None:
-    class Half(Untimed):
-        turn_seconds = 0.1
-
-        def __init__(self, log: Drive) -> None:
-            super().__init__(log)
-            self.timestamps = log.timestamps[1::2]
-            self.poses = log.poses[1::2]
-
-        def sweep(self, index: int) -> Sweep:
-            return super().sweep(2 * index + 1)
-
-    moved = np.asarray(DeskewedLog(Half(raw), "clockwise").sweep(1).points)
+    moved = np.asarray(DeskewedLog(Half(raw, 0.1), "clockwise").sweep(1).points)
     assert np.linalg.norm(moved - truth.sweep(3).points, axis=1).max() < 0.06  # chords of twice the length
 
 
@@ -412,6 +434,41 @@ def test_the_motion_over_a_gap_is_not_that_within_a_sweep(raw: Drive, truth: Dri
     late.gaps = frozenset([3])
     log = DeskewedLog(late, "clockwise")
     assert max(largest_error(log, truth, index) for index in (2, 3, 4, 5)) < 0.05
+
+
+def test_without_times_steps_over_missing_sweeps_move_no_points() -> None:
+    kept = [0, 1, 2, 3, 5, 6, 7, 8, 9, 10, 11]
+    raw, truth = make(num_sweeps=12), make(num_sweeps=12, is_deskewed=True)
+
+    class Kept(Untimed):
+        poses = raw.poses[kept]
+
+        def __init__(self, log: Drive) -> None:
+            super().__init__(log)
+            self.timestamps = range(len(kept))
+
+        def sweep(self, index: int) -> Sweep:
+            return replace(super().sweep(kept[index]), timestamp_ns=None)
+
+    log = DeskewedLog(Kept(raw))
+    assert log.scan.startswith("clockwise")
+    for index in (3, 4):
+        moved, expected = np.asarray(log.sweep(index).points), np.asarray(truth.sweep(kept[index]).points)
+        assert np.linalg.norm(moved - expected, axis=1).max() < 0.05
+
+
+def test_a_sweep_that_repeats_the_one_before_is_told_though_both_are_moved(raw: Drive) -> None:
+    class Repeated(Untimed):
+        def sweep(self, index: int) -> Sweep:
+            sweep = super().sweep(index)
+            again = replace(super().sweep(4), pose=sweep.pose, timestamp_ns=sweep.timestamp_ns)
+            return again if index == 5 else sweep
+
+    log = CachedLog(DeskewedLog(Repeated(raw), "clockwise"), 8)
+    assert [index for index in range(1, 8) if log.repeats(index)] == [5]
+    assert not np.array_equal(log.sweep(4).points, log.sweep(5).points)
+    texts = [finding.text for finding in examine(log) if finding.topic == "sweeps"]
+    assert texts[0].startswith("1 of them repeat the points of the sweep before, the first is sweep 5")
 
 
 def test_a_direction_without_poses_is_said(raw: Drive) -> None:

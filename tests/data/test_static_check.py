@@ -7,7 +7,7 @@ import pickle
 import re
 import warnings
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import pytest
@@ -492,6 +492,22 @@ def test_a_rotation_and_a_place_that_fit_only_together_are_one_matrix(real):
     assert np.hypot(*(matrix - ego_T_lidar)[:2, 3]) < 0.4
 
 
+@pytest.mark.parametrize("reader", ["ego", "sensor", "hdf5"])
+def test_the_matrix_that_is_told_contains_the_mounting_in_use(whole, tmp_path, reader):
+    first, more = (as_matrix(rotations_about(2, turn), (turn, 0.5, 1)) for turn in (0.3, 1.2))
+    if reader == "hdf5":
+        hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
+        hdf5.write_hdf5_scene(whole, tmp_path / "drive.h5")
+        make = partial(hdf5.HDF5Log, tmp_path / "drive.h5")
+    else:
+        write_array_log(whole, tmp_path)
+        make = partial(ArraysLog, tmp_path / whole.log_id, poses_of=reader)
+    log = make(ego_T_lidar=first)
+    corrected = make(ego_T_lidar=log.mounting_with(more)).sweep(2)
+    expected = transform_points(log.sweep(2).points, log.sweep(2).pose @ more)
+    assert np.allclose(transform_points(corrected.points, corrected.pose), expected, atol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("source", "degrees"),
     [
@@ -880,17 +896,24 @@ def ring(points, axis):
     return np.arange(len(points)) % 32
 
 
-@pytest.mark.parametrize("first", [np.linalg.norm, pytest.param(ring, marks=pytest.mark.slow)])
-def test_a_column_before_x_is_told_and_no_pose_is_blamed(drive, tmp_path, first):
+@pytest.mark.parametrize(
+    ("other", "place", "found"),
+    [
+        (np.linalg.norm, 0, "2, 3 and 4"),
+        (lambda points, axis: np.random.default_rng(0).random(len(points)) ** 2, 2, "1, 2 and 4"),
+        pytest.param(ring, 0, "2, 3 and 4", marks=pytest.mark.slow),
+    ],
+)
+def test_a_column_before_x_or_z_is_told_and_no_pose_is_blamed(drive, tmp_path, other, place, found):
     write_array_log(drive, tmp_path)
     for file in (tmp_path / drive.log_id / "points").iterdir():
         points = np.load(file)
-        np.save(file, np.column_stack([first(points, axis=1), points]).astype(np.float32))
+        np.save(file, np.insert(points, place, other(points, axis=1), axis=1))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         open_log("arrays", tmp_path / drive.log_id, ground=None)
     texts = [str(each.message) for each in caught]
-    assert any("first column does not seem to be x" in text for text in texts)
+    assert any(f"x, y and z seem to be in columns {found}" in text for text in texts)
     assert not any("the poses" in text or "world's frame" in text for text in texts)
 
 
@@ -947,6 +970,23 @@ def test_a_chosen_method_replaces_wrong_masks_only(drive):
     assert "data.find_ground=grid replaces it" in find_problems(inverted)[0]
     assert np.array_equal(GroundSegmentedLog(inverted, "auto").sweep(3).is_ground, inverted.sweep(3).is_ground)
     assert np.array_equal(GroundSegmentedLog(drive, "grid").sweep(3).is_ground, drive.sweep(3).is_ground)
+
+
+def test_poses_that_are_held_are_told_and_no_second_sensor(whole):
+    held = Wrong(whole, poses=lambda poses: poses[np.arange(len(poses)) // 2 * 2])
+    (text,) = [text for text in find_problems(held) if "ground masks" not in text]
+    assert "6 poses repeat the one before while the vehicle moves, the first is that of sweep 1" in text
+    assert "data.odometry=true" in text
+
+
+def test_steps_of_a_straight_fast_road_are_told(data_root):
+    hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
+    file = data_root / "kitti-raw" / "kitti-raw-0027-empty16.h5"
+    if not file.exists():
+        pytest.skip(f"needs {file.name}")
+    road = CachedLog(Thinned(hdf5.HDF5Log(file)), 16)
+    steps = Wrong(road, poses=lambda poses: np.concatenate([np.eye(4)[None], np.linalg.inv(poses[:-1]) @ poses[1:]]))
+    assert judge_log(steps).best == ("steps",)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.6])

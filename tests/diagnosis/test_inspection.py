@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cflow_torch.data.log import window
-from cflow_torch.diagnosis.inspection import Inspection
+from cflow_torch.diagnosis.inspection import Inspection, mask_problem
 from cflow_torch.diagnosis.point_frame import tilt_problem
 from cflow_torch.simulator import make_drive
 from cflow_torch.transforms import as_matrix, rotations_about, transform_points
@@ -49,6 +49,29 @@ def test_wrong_ground_masks_are_told(right, mask, text):
     wrong = replace(right, pc0=replace(right.pc0, is_ground=mask(right.pc0.is_ground)))
     (said,) = said_of(wrong)
     assert text in said
+
+
+@pytest.mark.parametrize(("place", "found"), [(0, "2, 3 and 4"), (1, "1, 3 and 4"), (2, "1, 2 and 4")])
+def test_a_column_before_z_is_told(right, place, found):
+    def with_column(sweep, place, values):
+        return replace(sweep, points=np.insert(sweep.points, place, values, axis=1))
+
+    ones = [with_column(sweep, place, 1) for sweep in (right.pc0, right.pc1)]
+    (said,) = said_of(replace(right, pc0=ones[0], pc1=ones[1]))
+    assert f"x, y and z seem to be in columns {found}" in said
+    for last in (1, np.linspace(0, 1, len(right.pc0.points))):
+        assert said_of(replace(right, pc0=with_column(right.pc0, 3, last))) == []
+
+
+def test_masks_of_the_next_sweep_are_told_and_those_of_a_height_are_not(kitti_file):
+    hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
+    with hdf5.HDF5Log(kitti_file) as log:
+        sweep, following = log.sweep(0), log.sweep(1)
+    heights = sweep.points[sweep.is_ground, 2]
+    for height in (0.1, 0.3, 0.8):
+        assert mask_problem(replace(sweep, is_ground=sweep.points[:, 2] < np.median(heights) + height)) == ""
+    mask = np.resize(following.is_ground, len(sweep.points))
+    assert "has it the rows of this sweep" in mask_problem(replace(sweep, is_ground=mask))
 
 
 def test_a_history_with_other_poses_or_in_the_reverse_order_is_told(right):

@@ -116,6 +116,7 @@ class ArraysLog(Log):
         self.has_viewpoints = trajectory is not None and trajectory.source == _VIEWPOINT
         whose = "lidar" if whose == "auto" and self.has_viewpoints else whose
         self.ego_T_lidar = np.eye(4) if whose == "sensor" else mounting
+        self._sensor_T_lidar = mounting if whose == "sensor" else np.eye(4)
         self.lidar_position = self.ego_T_lidar[:3, 3]
         if trajectory is not None and (stamps is None or table is not None):
             of_poses = trajectory.counted(None).times_ns
@@ -133,6 +134,9 @@ class ArraysLog(Log):
         self._note(f"its poses come from {_VIEWPOINT}" if self.has_viewpoints else "")
         if whose == "auto" and ego_T_lidar is not None and self.poses is not None:
             self._ask_whose_poses()
+
+    def mounting_with(self, T_poses_points: np.ndarray) -> np.ndarray:
+        return self._sensor_T_lidar @ T_poses_points @ self.ego_T_lidar
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and times where they are known."""

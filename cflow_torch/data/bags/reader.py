@@ -198,6 +198,9 @@ class BagLog(Log):
             return self._mount
         return self._frames.between(self.frame, self._lidar, np.array([time]))[0]  # type: ignore[no-any-return]
 
+    def mounting_with(self, T_poses_points: np.ndarray) -> np.ndarray:
+        return T_poses_points @ self._mount_at(self.timestamps[0])
+
     def sweep(self, index: int) -> Sweep:
         time = self._timestamp(index)
         columns, times = self._timed_cloud(time)

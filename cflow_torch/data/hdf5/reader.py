@@ -93,6 +93,9 @@ class HDF5Log(Log):
     def close(self) -> None:
         self._scene.close()
 
+    def mounting_with(self, T_poses_points: np.ndarray) -> np.ndarray:
+        return self.ego_T_lidar @ T_poses_points
+
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: points, float64 pose of their frame; ground mask and times if stored.
 
