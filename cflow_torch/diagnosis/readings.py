@@ -100,7 +100,7 @@ class Judgement:
     def confirmed_by(self, again: Judgement) -> Judgement:
         """Return the judgement without small mistakes that other pairs do not show.
 
-        Noise may fit one of them by chance, and poses are then inaccurate.
+        Noise may fit one of them by chance, and poses are then inaccurate. The motion of the points fits noise better.
         """
         if not self.best or not again.shares:
             return self
@@ -111,6 +111,7 @@ class Judgement:
             if not _is_small(name)
             or name.partition(" ")[0] in others
             or again.shares.get(name, 0) >= MARGIN * again.given
+            or self.shares.get(name, 0) >= self.free
         ]
         if names or not self.free >= _FREE * self.given:
             return replace(self, best=tuple(names))
