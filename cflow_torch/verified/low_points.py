@@ -11,6 +11,8 @@ out, too. No comparison sees it. At the end, its points take the motion of the n
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -39,34 +41,53 @@ def find_low_points(sweeps: HeightSlicedSweeps, is_moving: Tensor) -> tuple[Tens
 
     Cost: for each of these points that is at least 0.1 m above the ground, 121 lookups if a pixel is 0.1 m large.
     """
-    batch = sweeps.batch
-    row = flat_nonzero(batch.is_active & batch.has_result & ~sweeps.points.is_member)
-    if batch.ground is None:
-        return row[:0], row[:0]
-    window, step = split_index(batch.image.index_select(0, row).long(), sweeps.num_steps)
-    position = take_columns(batch.positions, row)
-    cell = torch.stack(sweeps.grid.row_col(position)).long()
-    beside = flat_nonzero((step == 1) & _are_beside(sweeps, is_moving, window, cell))
-    row, window, position, cell = row[beside], window[beside], position[:, beside], cell[:, beside]
-    pixel = torch.full_like(row, sweeps.num_pixels + 1)
-    is_above = 100 * position[2] >= batch.ground.at(position, window, batch.ground.mean() + _LOWEST)
-    above = flat_nonzero(is_above)
-    offset = _nearest_first(sweeps.grid.whole_pixels(_NEAR), row.device)  # [2, M, 1]
-    for some in chunks(0, len(above), row.device, offset.shape[1]):
-        point = above[some]
-        pixel[point] = _first_moving(sweeps, is_moving, window[point], cell[:, None, point] + offset)
-    return row, pixel
+    low = _LowPoints.of(sweeps)
+    beside = low.at(flat_nonzero(_are_beside(sweeps, is_moving, low)))
+    above = flat_nonzero(beside.is_above)
+    pixel = torch.full_like(beside.row, sweeps.num_pixels + 1)
+    offset = _nearest_first(sweeps.grid.whole_pixels(_NEAR), above.device)  # [2, M, 1]
+    for some in chunks(0, len(above), above.device, offset.shape[1]):
+        points = beside.at(above[some])
+        pixel[above[some]] = _first_moving(sweeps, is_moving, points.window, points.cell[:, None] + offset)
+    return beside.row, pixel
 
 
-def _are_beside(sweeps: HeightSlicedSweeps, is_moving: Tensor, window: Tensor, cell: Tensor) -> Tensor:
-    """Tell which of K points, with windows, (K,) int64, and cells, (2, K) int64, are beside an object, (K,) bool."""
+class _LowPoints(NamedTuple):
+    """K points of t that are not drawn, because they are low."""
+
+    row: Tensor  # (K,) int64, row of each point in the batch
+    window: Tensor  # (K,) int64
+    cell: Tensor  # (2, K) int64, row and column of its finest pixel
+    is_above: Tensor  # (K,) bool, high enough above the ground to be a part of an object
+
+    @classmethod
+    def of(cls, sweeps: HeightSlicedSweeps) -> _LowPoints:
+        """Select the points. Without known ground, all points are drawn."""
+        batch = sweeps.batch
+        of_t = slice(batch.rows[0].start, batch.rows[-1].stop)  # the points of t of all windows
+        is_low = batch.is_active[of_t] & batch.has_result[of_t] & ~sweeps.points[of_t].is_member
+        row = flat_nonzero(is_low) + of_t.start
+        window, _ = split_index(batch.image.index_select(0, row).long(), sweeps.num_steps)
+        position = take_columns(batch.positions, row)
+        is_above = torch.zeros_like(row, dtype=torch.bool)
+        if batch.ground is not None:
+            is_above = 100 * position[2] >= batch.ground.at(position, window, batch.ground.mean() + _LOWEST)
+        return cls(row, window, torch.stack(sweeps.grid.row_col(position)).long(), is_above)
+
+    def at(self, index: Tensor) -> _LowPoints:
+        """Select L of the points, (L,) int64."""
+        return _LowPoints(*(values.index_select(-1, index) for values in self))
+
+
+def _are_beside(sweeps: HeightSlicedSweeps, is_moving: Tensor, points: _LowPoints) -> Tensor:
+    """Tell which of K points are beside a moving object, (K,) bool."""
     side = sweeps.grid.whole_pixels(_BESIDE)
     lattice = sweeps.grid.lattice(side, border=1)
     movers = sweeps.pixels[flat_nonzero(is_moving & (sweeps.pixels.step == 1))]
     block = lattice.cell(movers.window, *floor_divide(movers.row_col, side))
     around = (block + lattice.square(1, block.device)).view(-1)
     is_beside = draw(around, sweeps.batch.num_windows * lattice.area)
-    return is_beside.index_select(0, lattice.cell(window, *floor_divide(cell, side)))
+    return is_beside.index_select(0, lattice.cell(points.window, *floor_divide(points.cell, side)))
 
 
 def _first_moving(sweeps: HeightSlicedSweeps, is_moving: Tensor, window: Tensor, cell: Tensor) -> Tensor:
