@@ -163,14 +163,9 @@ def _judge(usable: Sequence[Pair]) -> Judgement:
 def _judge_poses(moving: Sequence[Pair], scan: str) -> Judgement:
     """Compare the readings of the poses of pairs that move, under one scan."""
     of_pairs = [pair.shares_of_poses(scan) for pair in moving]
-    found: dict[str, Reading] = {}
-    motions = [motion_of(pair, scan) for pair in moving]
-    fitted = [replace(pair, transforms={GIVEN: motion}) for pair, motion in zip(moving, motions)]
-    free = float(np.mean([pair.share(scan) for pair in fitted]))
-    given = np.mean([each[GIVEN] for each in of_pairs])
-    is_in_world = any(WORLD in each for each in of_pairs)
-    if not is_in_world and free > _FREE * given:
-        found, others = _compare_motions(moving, scan, motions)
+    given = float(np.mean([each[GIVEN] for each in of_pairs]))
+    free, found, others = _read_motions(moving, scan, given)
+    if found:
         of_pairs = [{**each, **other.shares_of_poses(scan)} for each, other in zip(of_pairs, others)]
         moving = [
             replace(pair, transforms={**pair.transforms, **other.transforms}) for pair, other in zip(moving, others)
@@ -191,6 +186,19 @@ def _judge_poses(moving: Sequence[Pair], scan: str) -> Judgement:
     # Two clouds that stand still under no motion at all may have no static structure, so they do not show anything.
     is_hopeless = len(moving) > 1 or bool(_judge_motion(moving).best)
     return replace(judgement, best=(NO_READING,)) if is_hopeless else judgement
+
+
+def _read_motions(pairs: Sequence[Pair], scan: str, given: float) -> tuple[float, dict[str, Reading], Sequence[Pair]]:
+    """Return the share in place under the motions of the points and, if it is larger than `given`, what these tell.
+
+    The readings that follow from the motions, and the pairs with them, are those of `_compare_motions`.
+    """
+    motions = [motion_of(pair, scan) for pair in pairs]
+    fitted = [replace(pair, transforms={GIVEN: motion}) for pair, motion in zip(pairs, motions)]
+    free = float(np.mean([pair.share(scan) for pair in fitted]))
+    if free <= _FREE * given or any(WORLD in pair.transforms for pair in pairs):
+        return free, {}, ()
+    return free, *_compare_motions(pairs, scan, motions)
 
 
 def _may_be_traffic(name: str, pairs: Sequence[Pair], scan: str) -> bool:

@@ -118,12 +118,7 @@ class ArraysLog(Log):
         self.ego_T_lidar = np.eye(4) if whose == "sensor" else mounting
         self._sensor_T_lidar = mounting if whose == "sensor" else np.eye(4)
         self.lidar_position = self.ego_T_lidar[:3, 3]
-        if trajectory is not None and (stamps is None or table is not None):
-            of_poses = trajectory.counted(None).times_ns
-            if of_poses is not None and len(of_poses) == len(self.files):
-                stamps, table = of_poses.tolist(), None
-        if table is not None:
-            self._note(f"the times of its sweeps are those of {table.name}")
+        stamps = self._chosen_times(stamps, table, trajectory)
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
         self.poses = None
@@ -220,6 +215,19 @@ class ArraysLog(Log):
             )
             return trajectory, "lidar"
         return trajectory._replace(poses=converted), "lidar"
+
+    def _chosen_times(
+        self, stamps: list[int] | None, table: Path | None, trajectory: Trajectory | None
+    ) -> list[int] | None:
+        """Choose the times of poses, if each cloud has one, before those of a table; nanoseconds."""
+        if stamps is not None and table is None:
+            return stamps
+        of_poses = None if trajectory is None else trajectory.counted(None).times_ns
+        if of_poses is not None and len(of_poses) == len(self.files):
+            return of_poses.tolist()  # type: ignore[no-any-return]
+        if table is not None:
+            self._note(f"the times of its sweeps are those of {table.name}")
+        return stamps
 
     def _ask_whose_poses(self) -> None:
         """Take the poses for those of the LiDAR if the static world then stands still clearly better."""
