@@ -14,7 +14,7 @@ from cflow_torch.errors import warn
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError
 
-_LISTED = 20  # names in a message, or with one each
+_LISTED = 20  # most names in a message, or most messages of one name each
 _NO_CATEGORY = "NONE"
 # Metres added to length, width and height of the boxes of t, because annotated boxes are a little too tight.
 _MARGIN = (0.2, 0.2, 0.0)

@@ -68,7 +68,7 @@ DATA_SETS: dict[str, DataSet] = {
 }
 _NAMED_BY_PATH = ("arrays", "bags", "kitti", "pandaset")  # logs that have the names of their files or folders
 _OF_LAYOUTS = ("dataset", "sequences", "velodyne")  # folders whose names tell no log from another
-_DEEPEST = 4  # levels of folders below the root, in which we search for a mark
+_DEEPEST = 4  # levels of folders below the root whose contents we search for a mark
 
 
 class UserSource(NamedTuple):
@@ -207,12 +207,11 @@ def _why_nothing_fits(top: Path) -> str:
     from cflow_torch.data.arrays.cloud_file import SUFFIXES
     from cflow_torch.data.arrays.cloud_text import SUFFIXES as TEXTS
 
-    suffixes, num_levels = Counter(), 0  # type: ignore[var-annotated]
-    for paths in _paths_below(top):
-        num_levels = num_levels + 1
-        suffixes.update(suffix_of(path) or path.suffix for path in paths if path.is_file())
+    levels = list(_paths_below(top))
+    files = [path for paths in levels for path in paths if path.is_file()]
+    suffixes = Counter(suffix_of(path) or path.suffix for path in files)
     if not suffixes:
-        return f"it has no files that you may read, down to {num_levels - 1} folders below" if top.is_dir() else ""
+        return f"it has no files that you may read, down to {len(levels) - 1} folders below" if top.is_dir() else ""
     # Files next to clouds may be more: .json beside .pcap, .txt beside .las.
     known = [kind for kind, _ in suffixes.most_common() if kind in (*_CONVERSIONS, *SUFFIXES)]
     suffix = min(known, key=lambda kind: kind in TEXTS, default="")
@@ -309,7 +308,8 @@ def open_log(
         find_ground: method of `cflow_torch.ground.find_ground` for sweeps without a ground mask, "grid" or
             "patchwork", which also replaces masks that are surely wrong; "auto" = "grid" for those without, and `check`
             warns if it found ground; None = they stay without a mask.
-        odometry: True = estimate poses from the points, and ignore those that the log has; "refine" = correct these.
+        odometry: True = estimate poses from the points, and replace those that the log has (a reader that de-skews,
+            such as that of nuScenes, still uses these); "refine" = start from those.
         check: warn of likely mistakes, see `check_log`.
         read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`; or a
             value of `deskew`: "times", "clockwise", ...

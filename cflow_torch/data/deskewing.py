@@ -222,7 +222,10 @@ class DeskewedLog(LogWrapper):
 
     @cached_property
     def _interval(self) -> float:
-        """Seconds of one turn."""
+        """Seconds of one turn.
+
+        If sweeps of a slow log may be left out, it is the interval or a tenth of a second, whichever fits better.
+        """
         usual = float(np.median(self._gaps))
         if self._turn_seconds or usual < _LONG * _INTERVAL or self.poses is None or self._scans[-1] not in SCANS:
             return self._turn_seconds or usual

@@ -492,8 +492,8 @@ class _OfLog:
 for _name in (
     *("labels", "columns", "cameras", "poses", "trajectory", "readings", "judgement", "findings"),
     *("eval_mask", "stored_motion", "moving", "units", "boxes", "T_camera0_lidar", "sample_tokens"),
-    *("sweep_name", "frame_number", "sweep_times", "finds_ground", "has_estimated_poses"),
-    *("notes", "_note", "close", "unwrapped"),
+    *("sweep_name", "frame_number", "sweep_times", "finds_ground", "mounting_with"),
+    *("has_estimated_poses", "notes", "_note", "close", "unwrapped"),
 ):
     setattr(LogWrapper, _name, _OfLog(_name))  # `__getattr__` is not asked for members that `Log` has
 
@@ -531,7 +531,12 @@ class CachedLog(LogWrapper):
     def sweep(self, index: int) -> Sweep:
         return self._sweep(index)
 
+    @cached_property
+    def unmoved(self) -> Log:
+        return self if self.log.unmoved is self.log else CachedLog(self.log.unmoved, 2)
+
     def stop(self) -> None:
         """Forget the sweeps, and keep none from now on, so that callers may write into what they get."""
+        self.__dict__.pop("unmoved", None)
         self._count = 0
         self._sweep = lru_cache(0)(self.log.sweep)

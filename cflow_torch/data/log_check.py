@@ -125,7 +125,7 @@ def _held(log: Log) -> list[Finding]:
 
 
 _Check = Callable[[_CheckedLog], List[Finding]]
-_FOUND: _Check = methodcaller("findings")
+_OF_READER: _Check = methodcaller("findings")
 
 
 def check_log(log: Log) -> None:
@@ -141,7 +141,7 @@ def find_problems(log: Log) -> list[str]:
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """
-    findings = _collect(_CheckedLog(log, _CACHED), (_FOUND, _frame, _mask, _repeated, _lapses))
+    findings = _collect(_CheckedLog(log, _CACHED), (_OF_READER, _frame, _mask, _repeated, _lapses))
     return [finding.text for finding in findings if finding.status != RIGHT and finding.is_quick]
 
 
@@ -152,7 +152,7 @@ def examine(log: Log) -> list[Finding]:
     """
     checks = (
         _sensor,
-        _FOUND,
+        _OF_READER,
         _frame,
         _times,
         _poses,
@@ -279,7 +279,7 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
 def _fix_of(log: Log, name: str, reading: Reading) -> str:
     if reading.mount is None:
         return reading.fix or _setting(log, name)
-    ego_T_lidar = log.unwrapped.mounting_with(reading.mount)
+    ego_T_lidar = log.mounting_with(reading.mount)
     more = "" if np.array_equal(ego_T_lidar, reading.mount) else " in addition to the mounting in use"
     matrix = str((ego_T_lidar.round(3) + 0.0).tolist()).replace(" ", "")
     return f"{reading.fix}{more}: data.ego_T_lidar={matrix} (data=arrays, hdf5 or bags)"

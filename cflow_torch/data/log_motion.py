@@ -37,7 +37,7 @@ _AS_OTHERS = 0.75  # part of the share of the steps around, at least, under the 
 _HELD = 0.1  # motion over that next to it, below which a pose repeats the one before
 _OF_HELD = 0.25  # least share of such poses
 _NUM_SUSPECTS = 4  # steps that are compared with the points, largest first
-_LONG = 1.7  # length of a step over all those around it, if sweeps are missing
+_LONG = 1.7  # length of a step over the second longest of those around it, if sweeps are missing
 
 
 class Lapse(NamedTuple):
@@ -145,19 +145,12 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
         is_as_good = STILL in judgement.best or not in_world.fits < EQUAL * judgement.fits
         if WORLD in in_world.best and is_as_good:
             return in_world
-    hardly_moves = False
-    if poses is not None:  # points 20 m away move by less than 0.1 m in most sweep intervals
-        speed = difference(_motions(poses, slice(-1), slice(1, None)), np.eye(4))
-        hardly_moves = bool(np.median(speed) < _LEAST_TIMED)
-
-    def does_not_fit() -> bool:
-        return bool(judgement.best) or (judgement.is_low and not hardly_moves)
-
+    hardly_moves = poses is not None and bool(np.median(_step_sizes(poses)) < _LEAST_TIMED)
     is_small = judgement.given < _SMALL and not hardly_moves
-    if poses is not None and (does_not_fit() or is_small):  # are only a few sweeps wrong?
+    if poses is not None and (_does_not_fit(judgement, hardly_moves) or is_small):  # are only a few sweeps wrong?
         pairs = _pairs_without_repeats(log, poses, jumps, ()) or chosen  # all may repeat the one before
         judgement = judgement if pairs == chosen else judge(make_pairs(pairs, scans, False))
-        if does_not_fit():
+        if _does_not_fit(judgement, hardly_moves):
             others = _pairs_without_repeats(log, poses, jumps, {index for pair in pairs for index in pair})
             again = judge(make_pairs(others, scans, False))
             judgement = again if _contradicts(again, judgement) else judgement.confirmed_by(again)
@@ -169,6 +162,17 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     if STILL in judgement.best and log.unwrapped.has_viewpoints:
         return replace(judgement, shares={**judgement.shares, WORLD: judgement.shares[STILL]}, best=(WORLD,))
     return judgement
+
+
+def _step_sizes(poses: np.ndarray) -> np.ndarray:
+    """Return how far each step between (K, 4, 4) poses moves points 20 m away, (K-1,) metres."""
+    first = np.arange(len(poses) - 1)
+    return difference(_motions(poses, first, first + 1), np.eye(4))
+
+
+def _does_not_fit(judgement: Judgement, hardly_moves: bool) -> bool:
+    """Test whether another reading is better or, if the poses move, little of the structure is in place."""
+    return bool(judgement.best) or (judgement.is_low and not hardly_moves)
 
 
 def _without_motion(pair: Pair) -> Pair:
@@ -245,7 +249,7 @@ class Steps(NamedTuple):
 
     given: np.ndarray  # (K-1, 4, 4), maps each sweep to the next
     usual: np.ndarray  # (K-1, 4, 4), of the median rotation and speed of the steps around it
-    is_long: np.ndarray  # (K-1,) bool, longer than those around it but one, as if sweeps were missing
+    is_long: np.ndarray  # (K-1,) bool, much longer than all but one of those around it, as if sweeps were missing
     excess: np.ndarray  # (K-1,) metres by which a step differs, rotations at 10 m
 
     def beyond(self, metres: float, share: float) -> list[int]:
@@ -283,7 +287,7 @@ def held_poses(log: Log) -> list[int]:
     poses = known_poses(log)
     if poses is None or len(poses) < _FEWEST_POSES:
         return []
-    motion = difference(_motions(poses, slice(-1), slice(1, None)), np.eye(4))
+    motion = _step_sizes(poses)
     beside = np.maximum(np.append(motion[1:], 0), np.append(0, motion[:-1]))
     held = (np.flatnonzero((beside > _LEAST_MOTION) & (motion < _HELD * beside)) + 1).tolist()
     return held if len(held) >= _OF_HELD * len(poses) else []

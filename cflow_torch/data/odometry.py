@@ -1,4 +1,5 @@
-"""Poses estimated from the points by generalised ICP (extra `odometry`), for logs without poses, or to refine them.
+"""Poses estimated from the points by generalised ICP (extra `odometry`): for logs without poses or with wrong ones, or
+to refine noisy ones.
 
 Each sweep is aligned with the one before it, at first with far correspondences, then with near ones.
 """
@@ -84,7 +85,8 @@ class Odometry:
 def estimate_poses(log: Log, starts_from_poses: bool = True) -> np.ndarray:
     """Estimate (K, 4, 4) float64 `T_world_ego` of the sweeps of a log; the world is the ego frame of the first.
 
-    If the sweeps have poses, each alignment starts from the motion between them, unless you say that they are wrong.
+    If the sweeps have poses, each alignment starts from the motion between them. With `starts_from_poses=False`, their
+    poses are ignored.
     Cost: reads all sweeps.
     """
     odometry = Odometry()
@@ -116,5 +118,5 @@ class PosedLog(LogWrapper):
 
 
 def with_poses(log: Log, refine: bool = False) -> Log:
-    """Return a log with `estimate_poses`. Poses that it has are replaced; with `refine`, they are where we start."""
+    """Return a log with poses estimated from its points, which replace its own. With `refine`, we start from those."""
     return PosedLog(log, estimate_poses(log, refine), are_estimated=True)

@@ -170,9 +170,7 @@ class MotionWatch:
         self._usual: float | None = None  # share of the points that moved in the pair before
 
     def __call__(self, window: Window, result: FlowResult) -> str:
-        """Return what is wrong with the next pair of the log; "" = nothing, or the result is on a GPU."""
-        if result.is_valid.device.type != "cpu":
-            return ""
+        """Return what is wrong with the next pair of the log; "" = nothing."""
         count = int(result.is_valid.sum())
         if count < _FEWEST_WATCHED:
             return ""

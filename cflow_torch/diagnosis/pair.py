@@ -9,7 +9,7 @@ from typing import Callable, Sequence
 import numpy as np
 
 from cflow_torch.diagnosis.conventions import MOUNTS, OFF, READINGS, REVERSED, SCAN_READINGS, STILL, TIMES, UNITS, WORLD
-from cflow_torch.diagnosis.stillness import FEWEST_POINTS, Structure, structure_rows
+from cflow_torch.diagnosis.stillness import FEWEST_POINTS, Structure, cell_keys, structure_rows
 from cflow_torch.transforms import as_matrix, rigid_transform, transform_points
 from cflow_torch.types import Array, Sweep, as_numpy
 
@@ -182,4 +182,4 @@ def difference(T: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 def _blocks(points: np.ndarray) -> np.ndarray:
     """Return the key of the block of 5 m in the plane that holds each point, (N,) int64."""
-    return np.floor(points[:, :2] / _BLOCK).astype(np.int64) @ np.array((1 << 20, 1))  # type: ignore[no-any-return]
+    return cell_keys(np.floor(points * (1, 1, 0) / _BLOCK).astype(np.int64))

@@ -20,7 +20,7 @@ _SMALLEST, _WIDE, _LARGEST, _MILLIMETRES = 2.0, 200.0, 1000.0, 10_000.0
 _FAR, _NOT_NEAR = 50.0, 20.0
 _MOST_POINTS = 20_000
 _NEAR = 30.0  # metres
-# Metres of a sensor above the ground: cars have 1.5 to 2, trucks up to 4. In feet, cars have 4.5 to 8.
+# Metres of a sensor above the ground: cars have 1.5 to 2, trucks up to 4. If another unit is likely, only cars count.
 _LOWEST_SENSOR, _HIGHEST_SENSOR, _HIGHEST_ON_CAR = 1.1, 4.3, 2.75
 _FLAT = 0.6  # of a cloud with z up, the extent in z is less than this part of that in x or y
 _TALL = {  # readings of clouds that are flat in y or x, not in z

@@ -59,8 +59,8 @@ _UNCLEAR = 0.15  # share under the best reading of fast sweeps, below which they
 # Share under the motions that fit best over that as given, from which other motions are compared; if poses and points
 # are right, up to 1.13.
 _FREE = 1.1
-# Metres of such a motion from that of the poses. Less is within the cells of the search, and errors of measurement are
-# not larger.
+# Metres between the motion under which the points fit and that of the poses. A smaller difference than the first is
+# within the cells of the search. Noise does not make a larger one than the second.
 _SMALLEST_ERROR, _LARGEST_ERROR = 0.08, 1.5
 _HOPELESS = 0.04  # share as given, below which nothing fits
 _SEARCHED = 0.4  # share as given, below which we look for an unknown motion

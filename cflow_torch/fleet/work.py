@@ -146,7 +146,10 @@ class Worker:
         frame = _Frame(int(log.timestamps[index]))
         with _stage(frame, "read"):
             frame.content = sweeps = window(log, index, self._job.config.num_history, self._job.config.num_future)
-            frame.problem = pair_problem(sweeps.pc0, sweeps.pc1) or (REPEATED if log.repeats(index + 1) else "")
+            frame.problem = pair_problem(sweeps.pc0, sweeps.pc1)
+            # De-skewed sweeps that repeat each other differ.
+            if not frame.problem and log.unmoved is not log and log.repeats(index + 1):
+                frame.problem = REPEATED
         return frame
 
     def _compute(self, frames: list[_Frame]) -> list[_Frame]:

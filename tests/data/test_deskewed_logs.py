@@ -372,7 +372,10 @@ def test_a_log_of_every_second_sweep_is_moved_by_turns_not_by_pose_intervals(raw
 )
 def test_real_drives(scene: str, reading: str, data_root: Path) -> None:
     pytest.importorskip("h5py")
-    log: Any = open_log("hdf5", data_root / f"{scene}.h5", check=False)
+    file = data_root / f"{scene}.h5"
+    if not file.exists():
+        pytest.skip(f"needs {file.name}")
+    log: Any = open_log("hdf5", file, check=False)
     assert log.scan == reading
 
 

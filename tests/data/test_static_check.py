@@ -447,11 +447,11 @@ def test_two_sweeps_that_do_not_fit_are_told(drive, poses):
     assert text.startswith("the sweeps fit under no reading (only 0.00 of the static structure is in place)")
 
 
-def test_a_small_share_is_told_unless_it_is_larger_than_beside(drive):
+def test_a_small_share_that_is_larger_than_half_a_metre_farther_is_not_told(drive):
     random = np.random.default_rng(0)
     noisy = Wrong(drive, lambda points, _: points + random.normal(0, 0.08, points.shape))
     assert 0.04 < judge_log(noisy).given < 0.1 and find_problems(noisy) == [], "the poses are right"
-    assert Judgement({GIVEN: 0.05}).is_low
+    assert Judgement({GIVEN: 0.05}).is_low and not Judgement({GIVEN: 0.05}, is_peak=True).is_low
 
 
 def test_points_at_the_centres_of_voxels_are_told(drive):

@@ -1,4 +1,4 @@
-"""Low points that are not drawn move with a moving object near them; others are static. Beside it, this is not sure."""
+"""Low points that are not drawn move with a moving object near them. Others are static, but unknown beside one."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -81,7 +80,8 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
         good = [BinLayout()]
     if not kind:
         records = (BinLayout(3, "<f4", rest) for rest in range(1, _LONGEST_RECORD - 11))
-        good = list(islice((layout for layout in records if _are_records(content, layout)), 1))
+        record = next((layout for layout in records if _are_records(content, layout)), None)
+        good = [] if record is None else [record]
     if not good:
         counts = ", ".join(map(str, _COLUMNS))
         raise CFlowError(

@@ -86,9 +86,14 @@ def _parsed(content: bytes) -> tuple[str, list[_Element], bytes]:
 def _text_table(body: bytes, before: Sequence[_Element], vertex: _Element) -> np.ndarray:
     lines = [line.split() for line in with_plain_nan(body).splitlines() if line.strip()]
     first = sum(element.num_rows for element in before)
-    rows = [_without_lists(words, vertex) for words in lines[first : first + vertex.num_rows]]
+    rows: Sequence[Sequence[bytes]] = lines[first : first + vertex.num_rows]
+    names = vertex.scalars.names or ()
+    if vertex.has_lists:
+        rows = [_without_lists(words, vertex) for words in rows]
+    elif any(len(words) != len(names) for words in rows):
+        raise ValueError(f"a vertex has not {len(names)} numbers")
     table = np.zeros(len(rows), vertex.scalars)
-    for k, name in enumerate(vertex.scalars.names or ()):
+    for k, name in enumerate(names):
         table[name] = numbers_of([words[k] for words in rows], vertex.scalars[name])
     return table
 
@@ -97,6 +102,8 @@ def _without_lists(words: Sequence[bytes], vertex: _Element) -> list[bytes]:
     """Return the words of a vertex that are not in lists; if there are more or fewer, that is a ValueError."""
     kept, position = [], 0
     for one in vertex.properties:
+        if position >= len(words):
+            raise ValueError(f"a vertex has only {len(words)} numbers")
         if one.length_kind is None:
             kept.append(words[position])
         position += 1 if one.length_kind is None else 1 + int(words[position])

@@ -519,7 +519,9 @@ def _parts(path: Path, files: Sequence[Path] | None = None) -> list[Path]:
             return [path]
         renamed = [file for file in visible(path) if file.suffix in SUFFIXES]
         return sorted(renamed, key=lambda file: _part_of(file)[2]) or [path]
-    name, first, _ = _part_of(path)
+    name, first, own_number = _part_of(path)
+    if own_number != 0:
+        return [path]
     others = list(path.parent.glob("*")) if files is None else files
     known = [(*_part_of(file), file) for file in others if file.suffix == path.suffix]
     known = [each for each in known if each[0] == name and each[1] >= first and each[2] >= 0]
@@ -531,7 +533,7 @@ def _parts(path: Path, files: Sequence[Path] | None = None) -> list[Path]:
         # Two files of one number are of two recordings at a time, if their names have times.
         if number == len(parts) and (not first or numbers.count(number) == 1):
             parts.append(file)
-    return parts if path in parts[:1] else [path]
+    return parts or [path]  # two recordings of one name and time
 
 
 def _part_of(file: Path) -> tuple[str, str, int]:
