@@ -113,7 +113,7 @@ def register_deskewed(
 
     Cost: two registrations with times, else one; a few sorts of the points.
     """
-    registration = Registration(points, sweeps, len(start))
+    registration = Registration.of_objects(points, sweeps, len(start))
     apparent = registration.align(start, num_iterations)
     if sweeps.batch.has_pairs:
         apparent = apparent.only(~is_slow | registration.improves(apparent, is_slow))
@@ -122,7 +122,7 @@ def register_deskewed(
     stretch = registration.stretch(apparent)[:, None]
     divided = replace(apparent, flow=apparent.flow / stretch)
     with_history = points.at(flat_nonzero(sweeps.has_history.index_select(0, points.window)))
-    deskewed = Registration(deskew(with_history, sweeps, divided), sweeps, len(start))
+    deskewed = Registration.of_objects(deskew(with_history, sweeps, divided), sweeps, len(start))
     again = deskewed.align(start / stretch, num_iterations)
     is_again = Groups(with_history.object_id, len(start)).size() > 0
     return again.where(is_again, divided), apparent  # `again` where it is known, else `divided`
@@ -223,21 +223,30 @@ class Registration:
     """Aligns the voxels of G objects with those of the same objects at t+1.
 
     Args:
-        points: the points of the moving objects, in sweeps at most `MOST_TIME` sweep intervals from t+1.
+        voxels: those with the same `object_id` may match.
+        by_object: the voxels, grouped by what moves together.
+        centre: (2, G) float64, metres, x and y at t, about which each group rotates; NaN = it does not move.
+        elapsed: (B, S) float64, sweep intervals from each sweep to t+1.
 
     Cost: as `covariance_of`.
     """
 
-    def __init__(self, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_objects: int) -> None:
-        self._voxels = Voxels.of(points, sweeps)
-        self._target = VoxelSearch(self._voxels, flat_nonzero(self._voxels.step == 0))
-        self._covariance = covariance_of(self._voxels)  # [6, V]
-        object_id = self._voxels.object_id
-        by_object = Groups(object_id.masked_fill(object_id < 0, num_objects), num_objects)
-        at_t = by_object.where(self._voxels.step == 1)
-        self._centre = at_t.sum(self._voxels.position[:2]) / at_t.size()  # [2, G], at t; NaN without points
-        self._source = Source.of(self._voxels, self._covariance, by_object, self._centre, sweeps.elapsed)
-        self._sample = self._source.sample(self._voxels)
+    def __init__(self, voxels: Voxels, by_object: Groups, centre: Tensor, elapsed: Tensor) -> None:
+        self._voxels = voxels
+        self._target = VoxelSearch(voxels, flat_nonzero(voxels.step == 0))
+        self._covariance = covariance_of(voxels)  # [6, V]
+        self._centre = centre
+        self.source = Source.of(voxels, self._covariance, by_object, centre, elapsed)
+        self._sample = self.source.sample(voxels)
+
+    @classmethod
+    def of_objects(cls, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_objects: int) -> Registration:
+        """Prepare objects, each with one motion, from their points in sweeps at most `MOST_TIME` intervals from t+1."""
+        voxels = Voxels.of(points, sweeps)
+        by_object = Groups(voxels.object_id.masked_fill(voxels.object_id < 0, num_objects), num_objects)
+        at_t = by_object.where(voxels.step == 1)
+        centre = at_t.sum(voxels.position[:2]) / at_t.size()  # [2, G], at t; NaN without points
+        return cls(voxels, by_object, centre, sweeps.elapsed)
 
     def align(self, start: Tensor, num_iterations: int = _NUM_ITERATIONS) -> RigidMotion:
         """Refine the motion of every object, and estimate its rotation.
@@ -259,7 +268,7 @@ class Registration:
         start = torch.cat((start, torch.zeros_like(start[:, :1])), 1).t()  # [3, G]
         motion = start  # x, y and the tangent of half the angle, per sweep interval
         for iteration in range(num_iterations):
-            source = self._sample if iteration < num_iterations // 2 else self._source
+            source = self._sample if iteration < num_iterations // 2 else self.source
             equations = source.sum_by_object(partial(self._equations, self._rigid(motion)), 9)
             right_side = prior * (start - motion) + equations[6:]  # [3, G]
             change = matvec(full(inverse(held + equations[:6])), right_side)
@@ -288,7 +297,8 @@ class Registration:
         target = self._target.nearest(source.target_start, source.target_layers, moved)  # [K]
         residual = take_columns(self._voxels.position, target) - moved
         is_near = residual.square().sum(0) <= _FARTHEST**2
-        is_same = self._voxels.object_id.index_select(0, target) == source.by_object.of_item
+        object_id = self._voxels.object_id
+        is_same = object_id.index_select(0, target) == object_id.index_select(0, source.voxel)
         covariance = source.covariance + take_columns(self._covariance, target)
         information = full(inverse(covariance))
         pull = matvec(information, residual)  # [3, K]
@@ -304,26 +314,34 @@ class Registration:
             information=information * scale,
         )
 
+    def gains(self, rigid: RigidMotion, source: Source) -> Tensor:
+        """Return what each of K voxels of the source gains by a motion, (K,) float64.
+
+        This is the weight of its correspondence with the motion minus that without.
+
+        Cost: 54 lookups for each voxel.
+        """
+        static = rigid.only(torch.zeros_like(rigid.rotation, dtype=torch.bool))
+        gain = torch.empty_like(source.elapsed)
+        for some in chunks(0, len(source), gain.device, 9):
+            with_motion = self._correspond(source[some], rigid).weight
+            gain[some] = with_motion - self._correspond(source[some], static).weight
+        return gain
+
     def improves(self, rigid: RigidMotion, asked: Tensor) -> Tensor:
         """Tell which objects match t+1 significantly better with a motion than without, (G,) bool.
 
         `asked`, (G,) bool, are the objects to compare. The result is False for others.
 
-        Convention: a voxel gains the weight of its correspondence with the motion minus that without. The sum over the
-            object must exceed `_SLOW_Z` standard deviations of noise, the root of the sum of squares, and reach
-            `_LEAST_GAIN` per voxel.
+        Convention: the sum of the gains of the voxels of an object must exceed `_SLOW_Z` standard deviations of noise,
+            the root of the sum of squares, and reach `_LEAST_GAIN` per voxel.
 
-        Cost: 54 lookups for each voxel of the source.
+        Cost: as for `gains`.
         """
-        source = self._source[flat_nonzero(self._source.by_object.spread(asked))]
-        static = rigid.only(torch.zeros_like(asked))
-
-        def gains(some: Source) -> Tensor:
-            gain = self._correspond(some, rigid).weight - self._correspond(some, static).weight
-            return torch.stack((gain, gain.square(), torch.ones_like(gain)))
-
-        gain, square, count = source.sum_by_object(gains, 3)
-        return (gain > _SLOW_Z * square.sqrt()) & (gain >= _LEAST_GAIN * count)
+        source = self.source[flat_nonzero(self.source.by_object.spread(asked))]
+        gain = self.gains(rigid, source)
+        total, square, count = source.by_object.sum(torch.stack((gain, gain.square(), torch.ones_like(gain))))
+        return (total > _SLOW_Z * square.sqrt()) & (total >= _LEAST_GAIN * count)
 
     def stretch(self, rigid: RigidMotion) -> Tensor:
         """Return the time between two measurements of an object, divided by the time between their sweeps.
@@ -346,7 +364,7 @@ class Registration:
             weight = (pairs.information[0, 0] + pairs.information[1, 1]) * source.elapsed
             return weight * torch.stack((source.elapsed, delay))
 
-        square, late = self._source.sum_by_object(times, 2)
+        square, late = self.source.sum_by_object(times, 2)
         stretch = torch.where(square > 0, 1 + late / square, 1.0)
         return torch.where(stretch < _LEAST_STRETCH, 1.0, stretch)
 
