@@ -37,6 +37,7 @@ class Motion:
     moving: Tensor | None = None  # (M + 1,) float32, likewise
     # (A, P) float64, metres per sweep interval, flow of each point summed over coarser scales; None = no coarser scale.
     before: Tensor | None = None
+    corrected: Batch | None = None  # the batch with the ego motion that the method corrected; None = it is as given
 
     def cluster(self, points: slice) -> Tensor:
         """Return the cluster of each point in a slice; M = no cluster."""
@@ -179,6 +180,7 @@ class SceneFlowModel(nn.Module):
 
 def _results(batch: Batch, motion: Motion) -> list[FlowResult]:
     """One result per window, for all rows of its pc0."""
+    batch = batch if motion.corrected is None else motion.corrected
     points = slice(batch.rows[0].start, batch.rows[-1].stop)
     cluster = motion.cluster(points)
     is_valid = batch.has_result[points].clone()

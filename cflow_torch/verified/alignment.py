@@ -34,7 +34,7 @@ from cflow_torch.windows.collation import Batch
 _TALL = 2  # height slices of a pixel of structure, at least
 _SAMPLED = 0.8  # metres, side of the blocks that we take or leave out, so that all sweeps show the same surfaces
 _FEW, _MORE = 600, 3000  # pixels of structure, about, in all sweeps but t+1
-_FEW_ITERATIONS, _MORE_ITERATIONS = 2, 6
+_FEW_ITERATIONS, _MORE_ITERATIONS = 1, 6
 _MOST_ROUNDS = 3  # a round corrects points by up to about 0.2 m
 # What a voxel must gain on average, as a share of a perfect match. Real drives with good poses gain 0.012 at most. With
 # a noise of 2 cm and 0.1 degrees, they gain 0.02 to 0.28.

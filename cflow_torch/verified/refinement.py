@@ -224,7 +224,7 @@ class Registration:
 
     Args:
         voxels: those with the same `object_id` may match.
-        by_object: the voxels, grouped by what moves together.
+        by_object: the voxels, grouped by the motion that they share.
         centre: (2, G) float64, metres, x and y at t, about which each group rotates; NaN = it does not move.
         elapsed: (B, S) float64, sweep intervals from each sweep to t+1.
 

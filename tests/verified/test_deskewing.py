@@ -77,7 +77,7 @@ def test_both_walls_of_a_corner_count_for_the_time_between_two_sweeps():
     corner, times = np.concatenate((along_x, along_y)), np.repeat([0.0, 0.0, -0.2, 0.1], len(u))
     scene = with_times(one_object([corner, corner], (0.0, 0.0)), torch.from_numpy(times))
     rigid = RigidMotion(scene.flow, torch.zeros(1).double(), torch.zeros(1, 2).double())
-    assert abs(float(Registration(scene.points(), scene.sweeps, 1).stretch(rigid)) - 1.05) < 0.005
+    assert abs(float(Registration.of_objects(scene.points(), scene.sweeps, 1).stretch(rigid)) - 1.05) < 0.005
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.06])

@@ -24,7 +24,7 @@ from cflow_torch.verified.voxel_centroids import Voxels, covariance_of
 
 
 def registered(scene: Scene) -> RigidMotion:
-    return Registration(scene.points(), scene.sweeps, len(scene.flow)).align(scene.flow)
+    return Registration.of_objects(scene.points(), scene.sweeps, len(scene.flow)).align(scene.flow)
 
 
 def assert_equals_oracle(scene: Scene) -> RigidMotion:
@@ -53,7 +53,7 @@ def test_chunks_do_not_change_a_bit(at_once, monkeypatch):
     timed = replace(scene.points(), time=scene.points().position[0] / 10)
 
     def results() -> tuple[torch.Tensor, ...]:
-        registration = Registration(timed, scene.sweeps, len(scene.flow))
+        registration = Registration.of_objects(timed, scene.sweeps, len(scene.flow))
         motion = registration.align(scene.flow)
         better = registration.improves(motion, torch.ones(len(scene.flow), dtype=torch.bool))
         covariance = covariance_of(Voxels.of(timed, scene.sweeps))
@@ -193,7 +193,7 @@ def test_a_motion_must_gain_enough_and_more_than_noise(count, moved, is_better):
     row, col = np.divmod(np.arange(count), 6)
     cloud = np.stack((0.8 * col - 2.75, 0.6 * row - 1.75, np.full(count, 0.05)), 1)
     scene = one_object([cloud + (moved, 0.0, 0.0), cloud], (moved, 0.0))
-    registration = Registration(scene.points(), scene.sweeps, 1)
+    registration = Registration.of_objects(scene.points(), scene.sweeps, 1)
     truth = RigidMotion(scene.flow, torch.zeros(1).double(), torch.zeros(1, 2).double())
     assert registration.improves(truth, torch.tensor([True])).tolist() == [is_better]
     assert registration.improves(truth, torch.tensor([False])).tolist() == [False]
