@@ -9,7 +9,7 @@ import numpy as np
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.dense.method import CorrelationFlow
-from cflow_torch.diagnosis.inspection import Inspection
+from cflow_torch.diagnosis.inspection import Inspection, MotionWatch
 from cflow_torch.errors import warn
 from cflow_torch.ground.segmentation import GROUND_METHODS, find_ground_batch
 from cflow_torch.keypoints.method import CorrelationFlowKeypoints
@@ -104,6 +104,9 @@ def estimate_flow(
     window = _find_ground(window, ground, device)
     (result,) = make_model(config, device)([window])
     Inspection()([window])
+    problem = MotionWatch()(window, result) if result.is_valid.device.type == "cpu" else ""
+    if problem:
+        warn(problem)
     return result
 
 

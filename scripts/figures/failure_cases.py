@@ -85,7 +85,7 @@ _DEFAULT, _PAIR = (by("default"),), by("default", num_history=0)
 _PAPER_AND_DEFAULT = (by("paper"), *_DEFAULT)
 _GROUND_LEFT_IN = by("default", "`default`, ground=None", lambda sweep: replace(sweep, is_ground=None))
 _GROUND_FOUND = by("default", "`default`, ground='auto'", lambda s: replace(s, is_ground=find_ground(s.points)))
-_WRONG_FRAME = by("default", "`default`, wrong frame", misplace)
+_WRONG_FRAME = [by(preset, f"`{preset}`, wrong frame", misplace) for preset in ("paper", "default")]
 # The drive, the settings (the first one fails), and the seed of the picture.
 CASES: dict[str, tuple[Callable[[int], Staged], Sequence[Setting], int | None]] = {
     "long_side": (drives.tram, [by(p, num_history=h) for p, h in (("default", 0), ("offline", 0), ("default", 4))], 0),
@@ -102,7 +102,7 @@ CASES: dict[str, tuple[Callable[[int], Staged], Sequence[Setting], int | None]] 
     "sparse": (drives.sparse, (_PAIR, *_DEFAULT), 0),
     "beyond_region": (drives.far, (by("default"), by("default", "`default`, ±100 m", point_cloud_range=WIDE)), None),
     "ground_left_in": (drives.street, (_GROUND_LEFT_IN, _GROUND_FOUND), 1),
-    "wrong_frame": (drives.turn, (_WRONG_FRAME, by("default", "`default`, right frame")), 0),
+    "wrong_frame": (drives.turn, (*_WRONG_FRAME, by("default", "`default`, right frame")), 0),
     "appearing": (drives.appearing, (by("default"), by("offline")), 0),
     "appeared": (partial(drives.appearing, later=4), _DEFAULT, None),
     "rolling_shutter": (drives.rolling_shutter, _DEFAULT, None),
