@@ -140,17 +140,43 @@ def cut_sweep(sweep: Sweep, cut: str, index: int, t: int) -> tuple[Sweep, np.nda
     return Sweep(sweep.points[kept], is_ground=sweep.is_ground[kept], pose=sweep.pose), kept
 
 
-def with_noisy_poses(given: Window, seed: int) -> Window:
-    """Return a window without later sweeps, whose poses have noise: 2 cm in x and y, and 0.1 degrees of turn."""
-    rng = np.random.default_rng(seed)
+def with_pose_errors(given: Window, error: str, seed: int) -> Window:
+    """Return a window without later sweeps, whose poses have an error of `POSE_ERRORS`."""
+    sweeps, errors = given.sweeps, POSE_ERRORS[error](len(given.sweeps), np.random.default_rng(seed))
+    moved = [replace(sweep, pose=sweep.pose @ T) for sweep, T in zip(sweeps, errors)]
+    if error == "rounded positions":
+        for sweep in moved:
+            sweep.pose[:3, 3] = sweep.pose[:3, 3].round(1)
+    return given.with_sweeps(moved)
 
-    def noisy(sweep: Sweep) -> Sweep:
-        error = np.eye(4)
-        error[:3, :3] = Rotation.from_euler("z", rng.normal(0, 0.1), degrees=True).as_matrix()
-        error[:2, 3] = rng.normal(0, 0.02, 2)
-        return replace(sweep, pose=sweep.pose @ error)
 
-    return given.with_sweeps(map(noisy, given.sweeps))
+def _noise(metres: float, degrees: float) -> Callable[[int, np.random.Generator], np.ndarray]:
+    """Draw errors of x and y, and of the heading, normally distributed, (K, 4, 4)."""
+
+    def draw(count: int, rng: np.random.Generator) -> np.ndarray:
+        errors = np.tile(np.eye(4), (count, 1, 1))
+        errors[:, :3, :3] = Rotation.from_euler("z", rng.normal(0, degrees, count), degrees=True).as_matrix()
+        errors[:, :2, 3] = rng.normal(0, metres, (count, 2))
+        return errors
+
+    return draw
+
+
+def _of_one_pose(count: int, rng: np.random.Generator) -> np.ndarray:
+    errors = np.tile(np.eye(4), (count, 1, 1))
+    errors[rng.integers(2), :2, 3] = 0.12, 0.09  # of t or t+1
+    return errors
+
+
+# The errors of the poses of K sweeps, (K, 4, 4), in the frame of the vehicle.
+POSE_ERRORS: Mapping[str, Callable[[int, np.random.Generator], np.ndarray]] = {
+    "exact": _noise(0.0, 0.0),
+    "noise of 2 cm, 0.1 degrees": _noise(0.02, 0.1),
+    "noise of 10 cm, 0.5 degrees": _noise(0.1, 0.5),
+    "headings off by 0.3 degrees": _noise(0.0, 0.3),
+    "rounded positions": _noise(0.0, 0.0),
+    "one pose off by 15 cm": _of_one_pose,
+}
 
 
 def with_refined_poses(given: Window) -> Window:

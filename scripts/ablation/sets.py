@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Callable, NamedTuple, Sequence
 
 import numpy as np
-from derived_sets import CUTS, chain_flow, cut_sweep, paste_static, with_noisy_poses, with_refined_poses
+from derived_sets import CUTS, POSE_ERRORS, chain_flow, cut_sweep, paste_static, with_pose_errors, with_refined_poses
 
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.av2 import AV2Log
@@ -96,10 +96,12 @@ def make_sets(names: Sequence[str], seeds: Sequence[range]) -> list[ScoredSet]:
         ScoredSet("pandaset a1 h=4", "pandaset", lambda: kitti(PANDASET["a1"])[4:]),
         ScoredSet("pandaset c h=4", "pandaset", lambda: kitti(PANDASET["c"])[4:]),
     ]
-    for history in (0, HISTORY):
-        noisy = ScoredSet(f"noisy poses h={history}", "poses", noisy_poses, history)
-        refined = replace(noisy, name=f"refined poses h={history}", load=partial(noisy_poses, refine=True))
-        sets.extend((noisy, refined))
+    drives_of_poses = (("kitti", KITTI, 0), ("pandaset a1", PANDASET["a1"], 4), ("later kitti", KITTI_LATER, 4))
+    for drive, path, history in drives_of_poses:
+        name = f"{drive} h={history}, "
+        sets += [ScoredSet(name + each, "poses", partial(wrong_poses, path, each), history) for each in POSE_ERRORS]
+        refined = partial(wrong_poses, path, "noise of 2 cm, 0.1 degrees", refine=True)
+        sets.append(ScoredSet(f"{name}noise of 2 cm, 0.1 degrees, refined", "poses", refined, history))
     for name, stage in _SCENES.items():
         reach = drives.BORDERS[-1] if name == "border" else NEAR
         sets.append(ScoredSet(name, "scenes", partial(staged, stage), half_side=None, reach=reach))
@@ -145,12 +147,12 @@ def av2_pair() -> list[Item]:
     return [make_item(pair, log.labels(0), pose_flow=ego_motion_flow(pair.pc0.points, T_ego1_ego0))]
 
 
-def noisy_poses(refine: bool = False) -> list[Item]:
-    """Every other window of PandaSet a1 with noise in its poses; `refine` = corrected as by `data.odometry=refine`."""
+def wrong_poses(path: Path, error: str, refine: bool = False) -> list[Item]:
+    """Every other window of a scene, with wrong poses; `refine` = corrected as by `data.odometry=refine`."""
     items = []
-    for number, (given, frame) in enumerate(kitti(PANDASET["a1"])[HISTORY::2]):
-        noisy = with_noisy_poses(given, number)
-        items.append(Item(with_refined_poses(noisy) if refine else noisy, frame))
+    for number, (given, frame) in enumerate(kitti(path)[HISTORY::2]):
+        wrong = with_pose_errors(replace(given, pcf=()), error, number)
+        items.append(Item(with_refined_poses(wrong) if refine else wrong, frame))
     return items
 
 

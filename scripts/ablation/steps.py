@@ -82,6 +82,7 @@ STEPS: dict[str, dict[str, Any]] = {
     "no spacing": {"draw": partial(HeightSlicedSweeps.of, measure_spacing=_points_are_dense)},
     "no spacing of rings": {"draw": partial(HeightSlicedSweeps.of, measure_spacing=_rings_are_dense)},
     "no coverage": {"draw": _without_coverage},
+    "no alignment": {"align": lambda sweeps, draw: sweeps},
     "no changed pixels": {"find_changed": _without_changed},
     "no unchanged pixels": {"add_unchanged": lambda sweeps, tree, motion: tree},
     "no static test": {"find_components": _linked_may_move},
