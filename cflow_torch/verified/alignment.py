@@ -36,9 +36,10 @@ _SAMPLED = 0.8  # metres, side of the blocks that we take or leave out, so that 
 _FEW, _MORE = 600, 3000  # pixels of structure, about, in all sweeps but t+1
 _FEW_ITERATIONS, _MORE_ITERATIONS = 1, 6
 _MOST_ROUNDS = 3  # a round corrects points by up to about 0.2 m
-# What a voxel must gain on average, as a share of a perfect match. Real drives with good poses gain 0.012 at most. With
-# a noise of 2 cm and 0.1 degrees, they gain 0.02 to 0.28.
-_LEAST_GAIN = 0.01
+# What a voxel must gain on average, as a share of a perfect match, and what all of them gain together, in standard
+# deviations of noise. Real drives with good poses gain 0.012 at most. With a noise of 2 cm and 0.1 degrees, they gain
+# 0.02 to 0.28.
+_LEAST_GAIN, _GAIN_Z = 0.01, 4.0
 # The blocks that gain must outnumber those that lose by three standard deviations. So it takes structure in ten of
 # them at least: a single vehicle does not become the world.
 _VOTING = 5.0  # metres, side of a block
@@ -64,7 +65,7 @@ def corrections(sweeps: HeightSlicedSweeps) -> RigidMotion | None:
     The B S motions are those of the images of the batch (`Batch.image`). None = no sweep matches clearly better.
     """
     _, gains = _register(sweeps, _FEW, _FEW_ITERATIONS)
-    is_likely = gains.mean >= _LEAST_GAIN
+    is_likely = gains.are_likely()
     if not bool(is_likely.any()):
         return None
     motion, gains = _register(sweeps, _MORE, _MORE_ITERATIONS)
@@ -76,13 +77,18 @@ class Gains(NamedTuple):
     """What each of B S sweeps gains by a motion."""
 
     mean: Tensor  # (B S,) float64, of its voxels, see `Registration.gains`; NaN without any
+    z: Tensor  # (B S,) float64, their sum over the root of the sum of their squares
     num_better: Tensor  # (B S,) int64, blocks of 5 m whose voxels together gain
     num_worse: Tensor  # (B S,) int64, and lose
 
+    def are_likely(self) -> Tensor:
+        """Tell which gains are large enough, (B S,) bool."""
+        return (self.mean >= _LEAST_GAIN) & (self.z >= _GAIN_Z)
+
     def are_clear(self) -> Tensor:
-        """Tell which gains are large enough, and no accident, (B S,) bool."""
+        """Tell which gains are large enough, and those of most blocks, (B S,) bool."""
         noise = (self.num_better + self.num_worse).double().sqrt()
-        return (self.mean >= _LEAST_GAIN) & (self.num_better - self.num_worse > _VOTE_Z * noise)
+        return self.are_likely() & (self.num_better - self.num_worse > _VOTE_Z * noise)
 
 
 def _register(sweeps: HeightSlicedSweeps, most: int, num_iterations: int) -> tuple[RigidMotion, Gains]:
@@ -103,8 +109,13 @@ def _register(sweeps: HeightSlicedSweeps, most: int, num_iterations: int) -> tup
     row, col = floor_divide(voxels.place[2:].index_select(1, source.voxel), side)
     blocks = Groups(lattice.cell(source.by_object.of_item, row, col), count * lattice.area)
     of_block = blocks.sum(gain).view(count, -1)
-    mean = source.by_object.sum(gain) / source.by_object.size()
-    return motion, Gains(mean, (of_block > 0).sum(1), (of_block < 0).sum(1))
+    total, square = source.by_object.sum(torch.stack((gain, gain.square())))
+    return motion, Gains(
+        mean=total / source.by_object.size(),
+        z=total / square.sqrt(),
+        num_better=(of_block > 0).sum(1),
+        num_worse=(of_block < 0).sum(1),
+    )
 
 
 def _structure(sweeps: HeightSlicedSweeps, most: int) -> ObjectPoints:
