@@ -73,7 +73,7 @@ def test_importing_loads_nothing_heavy_and_changes_nothing():
 
 
 def test_messages_about_missing_packages_name_their_extra():
-    project = (PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8")
+    project = (Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8")
     listed = re.search(r"\[project.optional-dependencies\](.*?)\n\[", project, re.DOTALL).group(1)
     packages = {}
     for extra, members in re.findall(r"^(\w+) = \[(.+)$", listed, re.MULTILINE):

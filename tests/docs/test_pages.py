@@ -182,7 +182,9 @@ def test_links_have_targets_in_this_repository(page: Path) -> None:
 
 
 PROSE = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
-SOURCES = [path for name in ("cflow_torch", "configs", "scripts", "tests") for path in (ROOT / name).rglob("*.*")]
+PACKAGE = Path(cflow_torch.__file__).parent  # in an environment of check_environments.py, outside of the checkout
+FOLDERS = (PACKAGE, *(ROOT / name for name in ("configs", "scripts", "tests")))
+SOURCES = [path for folder in FOLDERS for path in folder.rglob("*.*")]
 # Words of other programs and placeholders that our files do not contain.
 OF_OTHERS = {
     *("TOPIC", "NEW", "aws", "gcloud", "anon", "FSSPEC_S3", "analytics", "load_frame_list", "relative_to_idx"),
