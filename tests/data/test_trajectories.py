@@ -1032,6 +1032,18 @@ def test_poses_of_seven_numbers_in_json_are_read(tmp_path, order, is_from_origin
     assert np.allclose(poses_text.read_poses(tmp_path / "poses.json").poses, np.delete(poses, 3, axis=0))
 
 
+@pytest.mark.parametrize("order", ["w first", "w last", "w last, rolled", "w last, of a camera"])
+def test_the_order_of_a_quaternion_without_names_follows_from_the_rotations(tmp_path, order) -> None:
+    """FAST-LIVO2 and CODa write w first. A vehicle and a tilted sensor turn about z, a camera about y."""
+    axis, roll = (1, 0.0) if order.endswith("camera") else (2, 0.3 * order.endswith("rolled"))
+    poses = as_matrix(rotations_about(axis, 0.02 * np.arange(12)) @ rotations_about(0, roll), POSES[:, :3, 3])
+    quaternions = np.roll(to_quaternions(poses[:, :3, :3]), 0 if order == "w first" else -1, 1)
+    table = np.column_stack([np.arange(12), poses[:, :3, 3], quaternions])
+    for numbers in (table, table[:, 1:], np.column_stack([np.arange(12), table])):
+        np.savetxt(tmp_path / "poses.txt", numbers, "%.17g")
+        assert np.allclose(poses_text.read_poses(tmp_path / "poses.txt").poses, poses), numbers.shape
+
+
 def test_quaternions_of_one_length_are_normalised(tmp_path) -> None:
     table = np.concatenate([POSES[:, :3, 3], 1000 * np.roll(to_quaternions(POSES[:, :3, :3]), -1, 1)], axis=1)
     np.savetxt(tmp_path / "poses.csv", table, "%.9f", ",", header="x,y,z,qx,qy,qz,qw", comments="")
