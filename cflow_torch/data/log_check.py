@@ -187,7 +187,7 @@ def _frame(log: _CheckedLog) -> list[Finding]:
 
     Then check the ego motion in the frame that the points will have.
     """
-    if log.is_empty:
+    if log.is_empty and not log.frame[1]:
         names = ", ".join(map(_name_of, log.typical))
         return [Finding("sweeps", WRONG, f"no point is finite in {names}: are the files complete?", True)]
     reading, problem = log.frame

@@ -64,7 +64,8 @@ def read_poses(path: PathLike) -> Trajectory:
 
     Convention: yaw turns x to y, pitch then z to x, roll then y to z. What is not named of z, roll and pitch is 0. The
         angles are degrees if their name says so, or one is larger than 2 pi, else radians. A quaternion q0 to q3, or
-        without names, has w first or last, as a vehicle turns mostly about z. Matrices called extrinsic or world to camera are inverted.
+        without names, has w first or last, as a vehicle turns mostly about z. Matrices called extrinsic or world to
+        camera are inverted.
     """
     path = as_path(path)
     if path.is_dir():
@@ -196,9 +197,7 @@ def _roles(names: Sequence[str]) -> dict[str, int]:
             first.setdefault(role, column)
     if "sec" in first and "nsec" not in first:
         first.setdefault("time", first.pop("sec"))
-    has_rotation = any(
-        set(group) <= set(first) for group in ({"z", *_QUATERNION}, {"z", *_ANY_ORDER}, {"yaw"})
-    )
+    has_rotation = any(set(group) <= set(first) for group in ({"z", *_QUATERNION}, {"z", *_ANY_ORDER}, {"yaw"}))
     has_position = {"x", "y"} <= set(first) or {"latitude", "longitude"} <= set(first)
     return first if MATRIX[0] in first or (has_position and has_rotation) else {}
 
