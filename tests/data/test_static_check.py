@@ -1031,6 +1031,13 @@ def test_points_in_the_world_without_poses_are_told_by_the_last_sweep(drive):
     assert "in sweep 11 the points lie around x = " in problem
 
 
+def test_points_in_the_frame_of_the_first_sweep_without_poses_are_told(drive):
+    """FAST-LIO2 writes such clouds. The static world stands still, but the sensor leaves the origin."""
+    start = np.linalg.inv(drive.sweep(0).pose)
+    (problem,) = find_problems(Wrong(drive, lambda points, pose: to_world(points, start @ pose), poses=lambda _: None))
+    assert "they are in the world's frame, and there are no poses: pass them" in problem
+
+
 def test_masks_and_repeated_sweeps_are_recognised(drive):
     assert "invert the mask" in find_problems(Wrong(drive, masks=np.logical_not))[0]
     repeated = Wrong(drive, order=[0, 0, *range(2, 12)])
