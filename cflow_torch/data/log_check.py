@@ -10,7 +10,7 @@ from typing import Any, Callable, Iterable, Iterator, List
 
 import numpy as np
 
-from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
+from cflow_torch.data.finding import CHOOSE, FOUND, RIGHT, UNREAD, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses, typical_sweeps
 from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, held_poses, judge_log
 from cflow_torch.data.neighbours import Neighbours
@@ -275,7 +275,10 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     name = judgement.best[0]
     if name == UNKNOWN:
         why = "there are no poses, but" if not has_poses else "the poses hardly move, but"
-        fix = "pass poses, or set data.odometry=true (in Python `with_poses` of cflow_torch.data.odometry)"
+        choices = [note[note.index(CHOOSE) :] for note in log.notes if CHOOSE in note]
+        unread = [f"pass poses ({note})" for note in log.notes if note.startswith(UNREAD)]
+        poses = [*choices, *unread, "pass poses"][0]
+        fix = f"{poses}, or set data.odometry=true (in Python `with_poses` of cflow_torch.data.odometry)"
     elif name in (NO_READING, INACCURATE) and log.unwrapped.has_sparse_poses:
         why, fix = "", _OF_SPARSE_POSES
     elif name == NO_READING:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any, Callable, Container, Dict, List, Mapping, Sequence
+from typing import Any, Callable, Container, Dict, Iterator, List, Mapping, Sequence
 
 import numpy as np
 
@@ -16,7 +17,8 @@ from cflow_torch.data.arrays.cloud_file import SUFFIXES, TABLES, may_be_cloud, n
 from cflow_torch.data.arrays.poses_text import STRUCTURED, files_of_poses, parse_poses, parse_times, read_poses
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.column_names import are_of_poses
-from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.file_errors import file_errors, shortened
+from cflow_torch.data.finding import CHOOSE, UNREAD
 from cflow_torch.data.folders import find_folders, natural_key, record_in, visible
 from cflow_torch.data.paths import PathLike, as_path, is_remote, read_start, stem_of, suffix_of
 from cflow_torch.data.trajectory import Trajectory
@@ -34,10 +36,12 @@ SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
 # Words in names of files of poses near a log, or whole names of their folders.
 _WORDS = {"poses", "pose", "trajectory", "trajectories", "odometry", "odom", "gt", "groundtruth"}
+_LIKE_POSES = {*_WORDS, "ego", "novatel", "oxts", "ins"}  # words in names of what may hold poses in another form
 # Suffixes of files that we test for poses and times.
 _TABLES = (".txt", ".csv", ".tum", ".log", ".g2o", ".json", ".jsonl", ".yaml", ".yml", ".npy")
 _NEAR_TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test in other folders
 _FIRST_UNIX, _MOST = 10**17, 50  # nanoseconds in 1973; files or folders
+_LONGEST = 150  # characters of a reason
 _MOST_EXACT = 0.5  # a file with poses at exactly the times of more than this share of the sweeps is preferred
 _TESTED = 8192  # bytes of a file that tell what it holds
 _FEWEST_POINTS = 20  # lines at the start of a text that may be a cloud
@@ -225,10 +229,14 @@ def resolve(folder: Path, setting: PathLike | None, names: Sequence[str], what: 
         found = [parent for parent in (folder / name for name in names) if parent.exists()]
         return only_one(found, folder, what)
     path = as_path(setting)
-    path = path if is_remote(path) or path.is_absolute() or path.exists() else folder / path
-    if not path.exists():
-        raise CFlowError(f"{what}={str(setting)!r} does not exist, neither here nor in {folder}")
-    return path
+    if is_remote(path) or path.is_absolute() or path.exists():
+        places = [path]
+    else:  # the user gave the folder or one above
+        places = [parent / path for parent in (folder, *islice(folder.resolve().parents, SEARCH_DEPTH))]
+    found = next((place for place in places if place.exists()), None)
+    if found is None:
+        raise CFlowError(f"{what}={str(setting)!r} does not exist, neither here nor in {folder} or above it")
+    return found
 
 
 def only_one(found: Sequence[Path], folder: Path, what: str) -> Path | None:
@@ -338,12 +346,73 @@ def find_poses_near(
             own += [file] if is_own else []
     found = {file: each for file, each in read_all(known, read_poses, tell).items() if fits(each)}
     files = _preferred(found, own, times_ns)
-    names = " and ".join(found[file].source for file in files)
     if len(files) == 1:
-        tell("" if files[0].stem == name else f"its poses are those of {names}")
+        tell("" if files[0].stem == name else f"its poses are those of {found[files[0]].source}")
         return found[files[0]]
-    tell(f"there are poses of its sweeps in {names}: choose one with data.poses=FILE" if files else "")
+    tell(_choice([found[file].source for file in files]) if files else "")
     return None
+
+
+def _choice(files: Sequence[Any]) -> str:
+    return f"there are poses of its sweeps: {CHOOSE}{' or '.join(map(str, files))}"
+
+
+def tell_unused_poses(
+    folder: Path, clouds: Sequence[Path], fits: Callable[[Trajectory], bool], tell: Callable[[str], None]
+) -> None:
+    """Tell which files may hold the poses of a log without poses, by their names or contents, and why none is used."""
+    if is_remote(folder):
+        return
+    fitting, unread = [], []
+    for path in islice(_like_poses(folder, clouds), _MOST):
+        name = os.path.relpath(path, folder.resolve())
+        try:
+            if suffix_of(path) == ".pkl":
+                raise CFlowError("pickles are not read")
+            poses = read_poses(path)
+        except CFlowError as error:
+            unread.append(f"{name} ({shortened(str(error).replace(str(path), 'it'), _LONGEST)})")
+            continue
+        is_calibration = len(poses.poses) > 1 and np.ptp(poses.poses, axis=0).max() == 0
+        if fits(poses) and not is_calibration:
+            fitting.append(name)
+        elif not is_calibration:
+            unread.append(f"{name} (its number of poses is {len(poses.poses)}, of sweeps {len(clouds)})")
+    if fitting:
+        tell(_choice(fitting))
+    elif unread:
+        tell(f"{UNREAD} {' or '.join(unread[:2])}")
+
+
+def _like_poses(folder: Path, clouds: Sequence[Path]) -> Iterator[Path]:
+    """Yield files, and folders with a file per sweep, that are called like poses or contain these words.
+
+    They lie in the folder of a log, in those above it, or below these but not in other logs.
+    """
+    stems = {stem_of(path) for path in clouds}
+    top = folder.resolve()
+    pending = [*zip((top, *top.parents), (0, 0, 2))]  # folders, and their depth
+    seen = {path.resolve() for path in clouds}
+    for place, depth in pending:
+        inside = [path for path in sorted(visible(place)) if path.resolve() not in seen]
+        files = [path for path in inside if suffix_of(path) in (*_TABLES, *STRUCTURED, ".pkl")]
+        seen.update(path.resolve() for path in inside)
+        of_sweeps = [path for path in files if stem_of(path) in stems]
+        if 2 * len(of_sweeps) > len(stems):  # a file per sweep
+            files = [path for path in files if path not in of_sweeps]
+            if _is_like_poses(of_sweeps[0], f"{place.parent.name} {place.name}"):
+                yield place if files_of_poses(place) else of_sweeps[0]
+        yield from (path for path in files[:_MOST] if _is_like_poses(path))
+        below = [path for path in inside if path.is_dir() and _holds_no_labels(path)][:_MOST]
+        pending += [(path, depth + 1) for path in below if depth < 2 and (place == top or not _places(path))]
+
+
+def _is_like_poses(file: Path, folder: str = "") -> bool:
+    words = re.split("[^a-z]+", f"{folder} {file.stem}".lower())
+    start = b""
+    with suppress(CFlowError), file_errors(file):
+        start = read_start(file, _TESTED).lower()
+    return not _LIKE_POSES.isdisjoint(words) or b"pose" in start or (b"rotation" in start and b"translation" in start)
 
 
 def _has_one(file: Path, names: Sequence[str]) -> bool:

@@ -44,6 +44,7 @@ _UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four ar
 STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz", ".npy")
 """Suffixes of files that must be whole to be read, see `tables_of_values`."""
 _IN_ORDER = "write all digits, a line per sweep, in the order of their times"
+_STARTS_WITH_NUMBERS = re.compile(rb"\s*[-+.\d]+[eE\d+-]*[ \t,]+[-+.\d]")  # a text, whatever its name
 _INVERSE = ("extrinsic", "world2", "world_to", "w2c")  # in names of matrices that map the world to the sensor
 
 
@@ -93,7 +94,7 @@ def parse_poses(content: bytes, path: Path) -> Trajectory:
         if numbers.ndim == 2 and numbers.shape[1] in _UNNAMED and numbers.dtype.kind in "fiu":
             return _poses_of_table(Table([], numbers.astype(str), []), path)
         return Trajectory(checked_poses(numbers, str(path)), None, False, str(path))
-    if suffix_of(path) not in STRUCTURED:
+    if suffix_of(path) not in STRUCTURED or _STARTS_WITH_NUMBERS.match(content):
         return _poses_of_table(parse_table(content, path), path)
     error = CFlowError(f"{path} has no list of poses: matrices of 16 or 12 numbers, or positions and rotations")
     found = []
@@ -161,6 +162,8 @@ def _layout(words: np.ndarray, have_names: bool) -> Sequence[str]:
     if count == 9:
         counts_rows = (np.diff(words[:, 0].astype(np.float64)) == 1).all()
         return usual if counts_rows else ()
+    if count == 13 and _are_matrices(words[:, :12]) and not _are_matrices(words[:, 1:]):
+        return (*MATRIX[:12], "time")
     if count == 16:
         ends_with_1 = (words[:, 15].astype(np.float64) == 1).all()
         has_time = not ends_with_1 and _are_homogeneous(words[:, 12:])
@@ -180,6 +183,12 @@ def _are_homogeneous(rows: np.ndarray) -> bool:
     numbers = rows.astype(np.float64)
     last = numbers[:, 3]
     return not numbers[:, :3].any() and bool((last == 1).all() or (len(last) > 1 and (np.diff(last) > 0).all()))
+
+
+def _are_matrices(words: np.ndarray) -> bool:
+    rotations = words.astype(np.float64).reshape(-1, 3, 4)[:, :, :3]
+    errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    return bool(np.nanmedian(errors) < 0.1)
 
 
 def _are_quaternions(words: np.ndarray) -> bool:
