@@ -49,6 +49,7 @@ _MOST_MAPS = 10  # clouds in a log's folder that may be maps, if a folder below 
 _LARGEST = 1 << 24  # bytes; structured files must be whole to be read, and poses take less
 # Numbers in names of files that count: not one or two digits behind letters, as in lidar0_000001.
 _COUNTERS = re.compile(r"(?<![A-Za-z\d])\d+|(?<=\d[A-Za-z])\d+|\d{3,}|\d+$")
+_TOKEN = re.compile(r"[0-9a-f]{16,}|[0-9a-f]{8}(-[0-9a-f]{4,12}){4}", re.IGNORECASE)  # hashes and random identifiers
 
 _Kinds = Dict[str, List[Path]]  # clouds of each suffix, or of each pattern of names
 
@@ -218,6 +219,12 @@ def find_clouds(folder: Path, suffix: str | None) -> list[Path]:
     if twice is not None:
         raise CFlowError(f"{parent} has several files of one name, such as {twice.name}: leave one of each")
     stamps = times_of_names([stem_of(path) for path in files])
+    are_tokens = all(_TOKEN.fullmatch(stem_of(path)) for path in files)
+    if are_tokens and 2 * sum(stem_of(path).isdecimal() for path in files) < len(files):
+        raise CFlowError(
+            f"the names of the clouds in {parent}, such as {files[0].name}, have no order: number them by their times "
+            "(in nuPlan, these are in its .db)"
+        )
     return files if stamps is None else [files[k] for k in np.argsort(stamps, kind="stable")]
 
 
@@ -233,10 +240,10 @@ def resolve(folder: Path, setting: PathLike | None, names: Sequence[str], what: 
         places = [path]
     else:  # the user gave the folder or one above
         places = [parent / path for parent in (folder, *islice(folder.resolve().parents, SEARCH_DEPTH))]
-    found = next((place for place in places if place.exists()), None)
-    if found is None:
+    existing = [place for place in places if place.exists()]
+    if not existing:
         raise CFlowError(f"{what}={str(setting)!r} does not exist, neither here nor in {folder} or above it")
-    return found
+    return existing[0]
 
 
 def only_one(found: Sequence[Path], folder: Path, what: str) -> Path | None:

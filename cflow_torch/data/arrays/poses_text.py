@@ -11,7 +11,7 @@ import numpy as np
 
 from cflow_torch.data.arrays.stamps import nanoseconds_of_numbers
 from cflow_torch.data.arrays.tables import MATRIX, Table, parse_table, tables_of_values
-from cflow_torch.data.column_names import role_of_name
+from cflow_torch.data.column_names import role_of_name, roles_of_names
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key, visible
 from cflow_torch.data.npy_file import read_npy
@@ -199,9 +199,10 @@ def _are_quaternions(words: np.ndarray) -> bool:
 def _roles(names: Sequence[str]) -> dict[str, int]:
     """Return the columns of the position, rotation and time that names tell; {} = they do not tell a pose."""
     first: dict[str, int] = {}
+    roles = roles_of_names(names)
     for column, name in sorted(enumerate(names), key=lambda named: "stamp" not in named[1].lower()):  # not of arrival
         last = name.rpartition(".")[2]
-        role = last if last in MATRIX else role_of_name(name)
+        role = last if last in MATRIX else roles[column]
         if role is not None:
             first.setdefault(role, column)
     if "sec" in first and "nsec" not in first:
