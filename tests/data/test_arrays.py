@@ -598,9 +598,9 @@ def test_names_without_order_are_told(tmp_path) -> None:
 
 def test_angles_of_points_do_not_make_a_table_of_poses(tmp_path) -> None:
     """Livox Viewer writes x, y, z and their radius, theta and phi."""
-    names = "Timestamp,X,Y,Z,Reflectivity,Ori_radius,Ori_theta,Ori_phi"
+    names = "Timestamp,X,Y,Z,Reflectivity,Tag,Ori_radius,Ori_theta,Ori_phi"
     for number in range(3):
-        rows = [f"{1700000000000000000 + k + 10**8 * number},{k},{number},1,20,9,8,7" for k in range(30)]
+        rows = [f"{1700000000000000000 + k + 10**8 * number},{k},{number},1,20,0,9,8,7" for k in range(30)]
         (tmp_path / f"frame_{number}.csv").write_text("\n".join([names, *rows]))
     assert find_array_logs(tmp_path) == [tmp_path]
     assert ArraysLog(tmp_path).sweep(1).points[:, 1].tolist() == [1] * 30
