@@ -81,7 +81,7 @@ def role_of_name(name: str) -> str | None:
 
 
 def roles_of_names(names: Sequence[str]) -> list[str | None]:
-    """Return what the columns of a table hold, see `role_of_name`. Next to phi or a radius, theta is no yaw."""
+    """Return what the columns of a table hold, see `role_of_name`. Next to phi or a radius, theta is not a yaw."""
     plain = list(map(_plain, names))
     are_spherical = any(re.fullmatch(".*(phi|radius)", name) for name in plain)
     is_angle = [are_spherical and name.endswith("theta") for name in plain]
