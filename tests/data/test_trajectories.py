@@ -1092,6 +1092,8 @@ def test_objects_of_other_keys_in_lines_are_one_object(tmp_path) -> None:
         ({"scene.pkl": "pose"}, r"scene.pkl \(pickles are not read\)"),
         ({"../scene.json": '{"rotation": 1, "translation": 2}'}, r"scene.json \(it has no list of poses"),
         ({f"calib/to_camera/{k:02d}.json": json.dumps({"pose": np.eye(4).tolist()}) for k in range(12)}, None),
+        ({"../other/maps/poses.txt": "matrices"}, None),
+        ({f"../novatel/data/{k:02d}.txt": "1 2 3 4 5\n" for k in range(12)}, "novatel/data .*has 5 numbers"),
         ({f"labels/{k:02d}.txt": "car 1 2 3 4 5\n" for k in range(12)}, None),
     ],
 )

@@ -392,9 +392,9 @@ def tell_unused_poses(
 
 
 def _like_poses(folder: Path, clouds: Sequence[Path]) -> Iterator[Path]:
-    """Yield files, and folders with a file per sweep, that are called like poses or contain these words.
+    """Yield files, and folders with a file per sweep, that are called like poses, or are no text and contain such words.
 
-    They lie in the folder of a log, in those above it, or below these but not in other logs.
+    They lie in the folder of a log, in two above it, two levels below it, or next to it in a folder that is called so.
     """
     stems = {stem_of(path) for path in clouds}
     top = folder.resolve()
@@ -411,15 +411,21 @@ def _like_poses(folder: Path, clouds: Sequence[Path]) -> Iterator[Path]:
                 yield place if files_of_poses(place) else of_sweeps[0]
         yield from (path for path in files[:_MOST] if _is_like_poses(path))
         below = [path for path in inside if path.is_dir() and _holds_no_labels(path)][:_MOST]
-        pending += [(path, depth + 1) for path in below if depth < 2 and (place == top or not _places(path))]
+        if top not in (place, *place.parents):  # folders next to the log may be other logs
+            below = [path for path in below if _is_called_like_poses(f"{place.name} {path.name}")]
+        pending += [(path, depth + 1) for path in below if depth < 2]
 
 
 def _is_like_poses(file: Path, folder: str = "") -> bool:
-    words = re.split("[^a-z]+", f"{folder} {file.stem}".lower())
     start = b""
     with suppress(CFlowError), file_errors(file):
-        start = read_start(file, _TESTED).lower()
-    return not _LIKE_POSES.isdisjoint(words) or b"pose" in start or (b"rotation" in start and b"translation" in start)
+        start = read_start(file, _TESTED).lower() if suffix_of(file) in (*STRUCTURED, ".pkl") else b""
+    has_words = b"pose" in start or (b"rotation" in start and b"translation" in start)
+    return has_words or _is_called_like_poses(f"{folder} {file.stem}")
+
+
+def _is_called_like_poses(name: str) -> bool:
+    return not _LIKE_POSES.isdisjoint(re.split("[^a-z]+", name.lower()))
 
 
 def _has_one(file: Path, names: Sequence[str]) -> bool:
