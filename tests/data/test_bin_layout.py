@@ -138,6 +138,15 @@ def test_a_file_may_hold_all_x_first(tmp_path, columns: int | None) -> None:
     assert find_bin_layout(table[np.argsort(table[:, 0])].tobytes()) == BinLayout(4)
 
 
+def test_all_files_with_all_x_first_have_one_number_of_columns() -> None:
+    """Half a column may differ from the other half, so twice as many columns explain more."""
+    table = street(4)
+    table[:1200, :2] *= 0.2
+    content = table.T.tobytes()
+    assert find_bin_layout(content) == find_bin_layout(content, 4) == BinLayout(4, is_planar=True)
+    assert find_bin_layout(table[:, :3].T.tobytes()) == BinLayout(3, is_planar=True)
+
+
 def test_records_of_many_numbers_are_read_and_the_columns_of_x_y_z_are_told(tmp_path) -> None:
     """DriveStudio's Waymo: origin of the laser, x, y, z, and others."""
     rng = np.random.default_rng(0)

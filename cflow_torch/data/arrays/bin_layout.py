@@ -125,12 +125,21 @@ def _good_layouts(content: bytes, kind: str) -> list[BinLayout]:
     if best < least or max(more.values()) == 1 > best:
         explained.update(more)
     if max(explained.values()) < least:
-        planar = [BinLayout(count, kind, is_planar=True) for count in _COLUMNS]
-        explained = {each: each.explained(content) for each in planar if len(content) % each.step == 0}
-        least = _EXPLAINED_PLANAR
+        return [
+            layout
+            for layout in (BinLayout(count, kind, is_planar=True) for count in _COLUMNS)
+            if _is_peak(layout, content)
+        ]
     fitting = {layout: share for layout, share in explained.items() if len(content) % layout.step == 0}
     least = max(_AS_GOOD * max(fitting.values(), default=0.0), least)
     return [layout for layout, share in fitting.items() if share >= least]
+
+
+def _is_peak(planar: BinLayout, content: bytes) -> bool:
+    """Test whether a planar layout explains a file, and more of it than one column more does."""
+    more = planar._replace(columns=planar.columns + 1)
+    shares = [each.explained(content[: len(content) // each.step * each.step]) for each in (planar, more)]
+    return len(content) % planar.step == 0 and shares[0] >= _EXPLAINED_PLANAR and shares[0] > shares[1]
 
 
 def _given_layout(content: bytes, given: BinLayout) -> BinLayout:

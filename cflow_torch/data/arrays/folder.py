@@ -392,9 +392,9 @@ def tell_unused_poses(
 
 
 def _like_poses(folder: Path, clouds: Sequence[Path]) -> Iterator[Path]:
-    """Yield files, and folders with a file per sweep, that are called like poses, or are no text and contain such words.
+    """Yield files and folders of a file per sweep that are called like poses, or are structured and contain such words.
 
-    They lie in the folder of a log, in two above it, two levels below it, or next to it in a folder that is called so.
+    They lie in the folder of a log, two levels above or below it, or next to it in a folder that is called so.
     """
     stems = {stem_of(path) for path in clouds}
     top = folder.resolve()
