@@ -80,6 +80,14 @@ def role_of_name(name: str) -> str | None:
     return next((role for role, pattern in _ROLES.items() if re.fullmatch(pattern, plain)), None)
 
 
+def roles_of_names(names: Sequence[str]) -> list[str | None]:
+    """Return what the columns of a table hold, see `role_of_name`. Next to phi or a radius, theta is not a yaw."""
+    plain = list(map(_plain, names))
+    are_spherical = any(re.fullmatch(".*(phi|radius)", name) for name in plain)
+    is_angle = [are_spherical and name.endswith("theta") for name in plain]
+    return [None if is_other else role_of_name(name) for name, is_other in zip(names, is_angle)]
+
+
 def are_of_poses(names: Iterable[str]) -> bool:
     """Test whether columns hold rotations, as those of poses or boxes do: a quaternion, or three angles.
 

@@ -31,10 +31,10 @@ def file_errors(file: Any, hint: str = "copy it again", doing: str = "read") -> 
         raise CFlowError(f"cannot {doing} {file} ({cause}); {guess}{hint}") from error
 
 
-def shortened(text: Any) -> str:
-    """Return the text on one line of at most 400 characters."""
+def shortened(text: Any, longest: int = _MAX_TEXT) -> str:
+    """Return the text on one line of at most so many characters."""
     line = " ".join(str(text).split())
-    return line if len(line) <= _MAX_TEXT else line[:_MAX_TEXT] + " ..."
+    return line if len(line) <= longest else line[:longest] + " ..."
 
 
 def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], hint: str = "copy it again") -> None:

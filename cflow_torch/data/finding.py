@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 RIGHT, FOUND, WRONG = "right", "found and used", "wrong"
+CHOOSE, UNREAD = "choose data.poses=", "we read no poses from"
+"""Parts of the notes of readers about poses that they do not use, which the check repeats if the sensor moves."""
 
 
 class Finding(NamedTuple):

@@ -10,19 +10,19 @@ from typing import Any, Callable, Iterable, Iterator, List
 
 import numpy as np
 
-from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
+from cflow_torch.data.finding import CHOOSE, FOUND, RIGHT, UNREAD, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses, typical_sweeps
 from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, held_poses, judge_log
 from cflow_torch.data.neighbours import Neighbours
 from cflow_torch.data.read_as import ReadAs, problem_of_columns
 from cflow_torch.diagnosis.conventions import READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD, Reading
 from cflow_torch.diagnosis.inspection import is_usual_interval, mask_problem
-from cflow_torch.diagnosis.pair import difference
+from cflow_torch.diagnosis.pair import difference, is_around
 from cflow_torch.diagnosis.point_frame import frame_problem, tilt_problem
 from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, Judgement
 from cflow_torch.diagnosis.stillness import IN_PLACE, LEAST_SHARE, Structure, are_finite, share_of_sweeps
 from cflow_torch.errors import CFlowError, warn
-from cflow_torch.transforms import relative_transform, transform_points
+from cflow_torch.transforms import as_matrix, relative_transform, transform_points
 from cflow_torch.types import Array, Sweep, as_numpy
 
 _CACHED = 12  # sweeps that several checks read
@@ -187,7 +187,7 @@ def _frame(log: _CheckedLog) -> list[Finding]:
 
     Then check the ego motion in the frame that the points will have.
     """
-    if log.is_empty:
+    if log.is_empty and not log.frame[1]:
         names = ", ".join(map(_name_of, log.typical))
         return [Finding("sweeps", WRONG, f"no point is finite in {names}: are the files complete?", True)]
     reading, problem = log.frame
@@ -195,7 +195,7 @@ def _frame(log: _CheckedLog) -> list[Finding]:
     is_last = not problem and known_poses(log) is None
     if is_last:
         checked = log.typical[-1]
-        _, problem = frame_problem(log.sweep(checked).points)
+        problem = frame_problem(log.sweep(checked).points)[1] or _problem_in_world(log)
     if not problem:
         right = Finding("frame", RIGHT, "metres, around the vehicle, z up", True)
         if not log.tilt:
@@ -214,6 +214,22 @@ def _frame(log: _CheckedLog) -> list[Finding]:
     # In another frame that we do not know, readings of the poses mean nothing, and sweeps need not fit.
     is_judged = reading or (is_last and not log.motion.is_low)
     return [wrong, *(_motion(log, reading) if is_judged else [])]
+
+
+def _problem_in_world(log: _CheckedLog) -> str:
+    """Return where the last sweep lies, if it lies elsewhere than the first one, but the static world stays in place.
+
+    Where the points of the first sweep lie need not be the sensor, because it may only look ahead.
+    """
+    if not log.motion.shares or log.motion.best or log.motion.is_low:
+        return ""
+    first, last = (as_numpy(log.sweep(index).points) for index in (log.typical[0], log.typical[-1]))
+    middles = [np.append(np.median(points[are_finite(points), :2], axis=0), 0) for points in (first, last)]
+    if not is_around(last[:, :3] - middles[0], as_matrix(np.eye(3), middles[1] - middles[0])):
+        return ""
+    x, y, _ = middles[1]
+    where = f"the points lie around x = {x:.0f} m, y = {y:.0f} m, so they are in the world's frame"
+    return f"{where}, and there are no poses: pass them, because points far from the origin have no flow"
 
 
 def _fitting(log: Log, readings: Iterable[str]) -> tuple[str, float]:
@@ -259,7 +275,10 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     name = judgement.best[0]
     if name == UNKNOWN:
         why = "there are no poses, but" if not has_poses else "the poses hardly move, but"
-        fix = "pass poses, or set data.odometry=true (in Python `with_poses` of cflow_torch.data.odometry)"
+        choices = [note[note.index(CHOOSE) :] for note in log.notes if CHOOSE in note]
+        unread = [f"pass poses ({note})" for note in log.notes if note.startswith(UNREAD)]
+        poses = [*choices, *unread, "pass poses"][0]
+        fix = f"{poses}, or set data.odometry=true (in Python `with_poses` of cflow_torch.data.odometry)"
     elif name in (NO_READING, INACCURATE) and log.unwrapped.has_sparse_poses:
         why, fix = "", _OF_SPARSE_POSES
     elif name == NO_READING:

@@ -14,14 +14,14 @@ from cflow_torch.data.log import FlowLabels, Log, LogWrapper, known_poses, poses
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.data.odometry import PosedLog
 from cflow_torch.diagnosis.conventions import LATEST, OF_POINTS, READINGS, REVERSED, TIMES_OF_POSES, WORLD
-from cflow_torch.diagnosis.point_frame import column_problem
+from cflow_torch.diagnosis.point_frame import MOST_COLUMNS, column_problem
 from cflow_torch.diagnosis.readings import STEPS
 from cflow_torch.errors import CFlowError
 from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
 
 _COARSEST = 0.01  # metres between two float32 coordinates
-_UNNAMED = default_names(5)[3:]  # columns after the first three, two of which may be y and z
+_UNNAMED = default_names(MOST_COLUMNS)[3:]  # columns after the first three, which may be x, y and z
 READ_AS = ("auto", None, *READINGS)
 
 

@@ -233,11 +233,11 @@ def pair_problem(pc0: Sweep, pc1: Sweep) -> str:
 
 
 def repeats(pc0: Sweep, pc1: Sweep) -> bool:
-    """Test whether two sweeps have the same points, at least 100. False for tensors on a GPU, so as not to wait."""
+    """Test whether two sweeps have the same points, at least 100, some finite. False on a GPU, so as not to wait."""
     for points in (pc0.points, pc1.points):
         if len(points) < _FEWEST_REPEATED or (isinstance(points, torch.Tensor) and points.device.type != "cpu"):
             return False
-    return have_same_points(pc0, pc1)
+    return have_same_points(pc0, pc1) and bool(are_finite(as_numpy(pc0.points)).any())
 
 
 def inactive_problems(windows: Sequence[Window], results: Sequence[FlowResult], config: Config) -> list[str]:

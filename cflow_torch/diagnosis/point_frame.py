@@ -39,7 +39,7 @@ _TILT_APART, _AGREEING = 0.5, 0.75
 # as rings, have few values.
 _SIDE, _FEWEST_IN_CELL, _APART, _LEAST_SMOOTH = 0.5, 5, 0.1, 0.2
 _LEAST_HEIGHT, _OF_A_BYTE = 1.0, 256
-_MOST_COLUMNS = 5
+MOST_COLUMNS = 16
 
 
 def frame_problem(points: Array) -> tuple[str, str]:
@@ -86,14 +86,15 @@ def frame_problem(points: Array) -> tuple[str, str]:
 
 
 def column_problem(columns: Array) -> str:
-    """Return which columns of a sweep, (N, C), seem to be x, y and z, among five; "" = the first three, or unknown.
+    """Return which columns of a sweep, (N, C), seem to be x, y and z, among 16; "" = the first three, or unknown.
 
     Together, they have ground, and heights that are alike nearby. Cost: 10 ms; 0.1 s if the first three have not.
     """
     if columns.shape[1] < 4 or len(columns) < _FEWEST:
         return ""
     step = len(columns) // _MOST_POINTS + 1
-    table = as_numpy(columns[::step])[:, :_MOST_COLUMNS].astype(np.float64)
+    table = as_numpy(columns[::step])[:, :MOST_COLUMNS].astype(np.float64)
+    table[:, ~np.isfinite(table).any(axis=0)] = 0  # one position for all points counts as missing
     table = table[np.isfinite(table).all(axis=1)]
     if _smoothness(table[:, :3]) > _LEAST_SMOOTH:
         return ""

@@ -154,7 +154,7 @@ def _judge(usable: Sequence[Pair]) -> Judgement:
     judgement = _judge_poses(moving, scan)
     is_unclear = judgement.best in ((NO_READING,), (INACCURATE,)) or judgement.fits < _UNCLEAR
     if fast and is_unclear:  # the sweeps may be skewed and the poses be of another frame
-        scans = [each for each in DIRECTIONS if each in fast[0].scans and each != scan]
+        scans = [each for each in fast[0].scans if each != scan]
         named = [each for each in (_judge_poses(moving, scan) for scan in scans) if each.fits > _TURN * judgement.fits]
         judgement = max(named, key=lambda each: each.fits, default=judgement)
     return replace(judgement, shares_of_scans=shares_of_scans if judgement.scan == scan else {})

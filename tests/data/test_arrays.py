@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import hashlib
 import warnings
 from pathlib import Path
 from typing import Any
@@ -585,3 +586,21 @@ def test_clouds_in_a_folder_of_any_name_are_found_next_to_their_poses(tmp_path: 
     (folder,) = find_array_logs(tmp_path)
     log = ArraysLog(folder)
     assert log.log_id == "drive" and log.poses is not None and len(log) == 3
+
+
+def test_names_without_order_are_told(tmp_path) -> None:
+    """nuPlan's clouds are called as their tokens."""
+    for number in range(4):
+        np.save(tmp_path / f"{hashlib.sha256(bytes([number])).hexdigest()[:16]}.npy", np.ones((30, 3)))
+    with pytest.raises(CFlowError, match="have no order: number them by their times"):
+        ArraysLog(tmp_path)
+
+
+def test_angles_of_points_do_not_make_a_table_of_poses(tmp_path) -> None:
+    """Livox Viewer writes x, y, z and their radius, theta and phi."""
+    names = "Timestamp,X,Y,Z,Reflectivity,Tag,Ori_radius,Ori_theta,Ori_phi"
+    for number in range(3):
+        rows = [f"{1700000000000000000 + k + 10**8 * number},{k},{number},1,20,0,9,8,7" for k in range(30)]
+        (tmp_path / f"frame_{number}.csv").write_text("\n".join([names, *rows]))
+    assert find_array_logs(tmp_path) == [tmp_path]
+    assert ArraysLog(tmp_path).sweep(1).points[:, 1].tolist() == [1] * 30

@@ -9,8 +9,9 @@ import pytest
 
 from cflow_torch import CFlowError
 from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
-from cflow_torch.data.arrays.cloud_file import read_cloud
+from cflow_torch.data.arrays.cloud_file import copy_rows, read_cloud
 from cflow_torch.data.arrays.reader import ArraysLog
+from cflow_torch.data.log_check import find_problems
 from cflow_torch.types import CFlowWarning
 
 
@@ -86,7 +87,7 @@ def test_records_of_several_types_are_read_by_their_first_three_numbers(tmp_path
         assert len(ArraysLog(tmp_path).sweep(1).points) == 2399
 
 
-@pytest.mark.parametrize("content", [packed()[:-3], street(4).tobytes()[:-4], street(4).T.tobytes(), b"a text " * 9000])
+@pytest.mark.parametrize("content", [packed()[:-3], street(4).tobytes()[:-4], b"a text " * 9000])
 def test_other_files_are_refused_and_the_setting_is_named(tmp_path, content: bytes) -> None:
     (tmp_path / "a.bin").write_bytes(content)
     with pytest.raises(CFlowError, match=r"a\.bin.*bin_columns"):
@@ -104,8 +105,11 @@ def test_a_folder_has_one_layout_which_is_said(tmp_path, recwarn: Any) -> None:
         log = ArraysLog(tmp_path / "5")
     assert np.array_equal(log.sweep(1).points, street(5)[1:, :3]) and log.notes
     assert len(ArraysLog(tmp_path / "5", bin_columns=5).sweep(0).points) == 2400
+    with pytest.raises(CFlowError, match="does not look like 7 float32 per point, but like 5 .*data.bin_columns=5"):
+        ArraysLog(tmp_path / "5", bin_columns=7)
+    (tmp_path / "4" / "1.bin").write_bytes(street(4).tobytes()[:-4])
     with pytest.raises(CFlowError, match="not a multiple"):
-        ArraysLog(tmp_path / "5", bin_columns=7).sweep(0)
+        ArraysLog(tmp_path / "4", bin_columns=4).sweep(1)
 
 
 def test_a_log_may_mix_numbers_of_columns(tmp_path) -> None:
@@ -115,3 +119,51 @@ def test_a_log_may_mix_numbers_of_columns(tmp_path) -> None:
         table.tofile(tmp_path / f"{number}.bin")
     for sweep, table in zip(ArraysLog(tmp_path), tables):
         assert np.array_equal(sweep.points, table[:, :3])
+
+
+@pytest.mark.parametrize("columns", [None, 4])
+def test_a_file_may_hold_all_x_first(tmp_path, columns: int | None) -> None:
+    """Oxford RobotCar. Read with the wrong order, its points would be random, and everything would stand still."""
+    table = street(4)
+    (tmp_path / "a.bin").write_bytes(table.T.tobytes())
+    layout = find_bin_layout(table.T.tobytes(), columns)
+    assert layout == BinLayout(4, is_planar=True) and layout.fits(table.T.tobytes())
+    assert np.array_equal(read_cloud(tmp_path / "a.bin", columns), table[:, :3])
+    is_kept = np.arange(len(table)) % 3 > 0
+    (tmp_path / "b.bin").write_bytes(b"")
+    copy_rows(tmp_path / "a.bin", tmp_path / "b.bin", is_kept)
+    assert np.array_equal(read_cloud(tmp_path / "b.bin"), table[is_kept, :3])
+    with pytest.raises(CFlowError, match="does not look like 5 float32 per point, but like 4 .*all x first"):
+        find_bin_layout(table.T.tobytes(), 5)
+    assert find_bin_layout(table[np.argsort(table[:, 0])].tobytes()) == BinLayout(4)
+
+
+def test_all_files_with_all_x_first_have_one_number_of_columns() -> None:
+    """Half a column may differ from the other half, so twice as many columns explain more."""
+    table = street(4)
+    table[:1200, :2] *= 0.2
+    content = table.T.tobytes()
+    assert find_bin_layout(content) == find_bin_layout(content, 4) == BinLayout(4, is_planar=True)
+    assert find_bin_layout(table[:, :3].T.tobytes()) == BinLayout(3, is_planar=True)
+
+
+def test_records_of_many_numbers_are_read_and_the_columns_of_x_y_z_are_told(tmp_path) -> None:
+    """DriveStudio's Waymo: origin of the laser, x, y, z, and others."""
+    rng = np.random.default_rng(0)
+    distance, angle, z = rng.uniform((2, -np.pi, -1.75), (30, np.pi, -1.7), (12_000, 3)).T
+    x, y = distance * np.cos(angle), distance * np.sin(angle)
+    z[:2400], x[:2400] = rng.uniform(-1.7, 3, 2400), 20  # a wall
+    zeros = np.zeros(len(x))
+    columns = [zeros + 1.4, zeros, zeros + 2.2, x, y, z, *[zeros] * 4, *rng.random((3, len(x))), zeros + 1]
+    table = np.stack(columns, axis=1).astype("f4")
+    assert find_bin_layout(table.tobytes()) == find_bin_layout(table.tobytes(), 14) == BinLayout(14)
+    for k in range(2):
+        table.tofile(tmp_path / f"{k}.bin")
+    texts = find_problems(ArraysLog(tmp_path))
+    assert any("x, y and z seem to be in columns 4, 5 and 6" in text for text in texts)
+    assert not any("are the files complete" in text or "repeats" in text for text in texts)
+
+
+def test_files_of_cloudcompare_are_told(tmp_path) -> None:
+    with pytest.raises(CFlowError, match="CloudCompare's own format.*save it there as .ply"):
+        find_bin_layout(b"CCB2" + street(4).tobytes())

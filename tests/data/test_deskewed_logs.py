@@ -21,11 +21,12 @@ from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.finding import RIGHT
 from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper
 from cflow_torch.data.log_check import examine
+from cflow_torch.diagnosis import readings
 from cflow_torch.diagnosis.stillness import Structure, static_rows, thinned_rows
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.street import build_street
-from cflow_torch.transforms import poses_at
+from cflow_torch.transforms import poses_at, rotations_about
 from cflow_torch.types import CFlowError, CFlowWarning, Sweep
 from cflow_torch.windows.deskewing import scan_fractions
 
@@ -501,3 +502,18 @@ def test_points_of_four_columns_and_of_nan_move_along_a_trajectory(raw: Drive) -
         warnings.simplefilter("error")
         moved = DeskewedLog(Four(raw), "clockwise").sweep(2).points
     assert np.isnan(moved[0]).all() and np.abs(moved[1:] - three.sweep(2).points[1:]).max() < 0.02
+
+
+def test_a_turned_lidar_whose_points_have_times_is_named(raw: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """ZOD: x of the LiDAR points to the right, so nothing fits as given, and noise chooses between the scans."""
+
+    class Turned(LogWrapper):
+        has_raw_times = True
+
+        def sweep(self, index: int) -> Sweep:
+            sweep = self.log.sweep(index)
+            return replace(sweep, points=np.asarray(sweep.points) @ rotations_about(2, np.pi / 2).T.astype("f4"))
+
+    monkeypatch.setattr(readings, "_best_scan", lambda pairs: ("times", {}))
+    log = DeskewedLog(Turned(raw))
+    assert log.judgement is not None and log.judgement.best == ("left",) and log.scan == "off"

@@ -1031,6 +1031,26 @@ def test_points_in_the_world_without_poses_are_told_by_the_last_sweep(drive):
     assert "in sweep 11 the points lie around x = " in problem
 
 
+def test_points_in_the_frame_of_the_first_sweep_without_poses_are_told(drive):
+    """FAST-LIO2 writes such clouds. The static world stands still, but the sensor leaves the origin."""
+    start = np.linalg.inv(drive.sweep(0).pose)
+    (problem,) = find_problems(Wrong(drive, lambda points, pose: to_world(points, start @ pose), poses=lambda _: None))
+    assert "they are in the world's frame, and there are no poses: pass them" in problem
+
+
+def test_missing_poses_are_told_with_the_files_that_may_have_them(drive, tmp_path):
+    write_array_log(drive, tmp_path)
+    folder = tmp_path / drive.log_id
+    (folder / "results" / "a").mkdir(parents=True)
+    (folder / "poses.txt").rename(folder / "results" / "a" / "poses.txt")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        log = open_log("arrays", folder, check=False)
+    assert any(
+        "there are no poses" in text and "choose data.poses=results/a/poses.txt" in text for text in find_problems(log)
+    )
+
+
 def test_masks_and_repeated_sweeps_are_recognised(drive):
     assert "invert the mask" in find_problems(Wrong(drive, masks=np.logical_not))[0]
     repeated = Wrong(drive, order=[0, 0, *range(2, 12)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -263,6 +264,10 @@ LAYOUTS = {
     "16 numbers": rows(POSES.reshape(12, 16), ","),
     "by columns": rows(POSES.transpose(0, 2, 1).reshape(12, 16)),
     "time, by columns": rows([(k, *pose.T.reshape(-1)) for k, pose in enumerate(POSES)]),
+    "12 numbers and the time": [
+        "# R00 R01 R02 tx ... time",
+        *rows([(*p[:3].reshape(-1), k) for k, p in enumerate(POSES)]),
+    ],
     "trajectory of Open3D": [line for k, pose in enumerate(POSES) for line in (f"{k} {k} {k + 1}", *rows(pose))],
     "time and angles": rows([(k, *POSES[k, :3, 3], *ANGLES[k]) for k in range(12)], ","),
     "angles": rows([(*POSES[k, :3, 3], *ANGLES[k]) for k in range(12)]),
@@ -300,6 +305,7 @@ def test_layouts_of_poses(tmp_path, layout) -> None:
     assert np.allclose(read.poses, POSES, atol=1e-12)
     has_times = layout in (
         "13 numbers",
+        "12 numbers and the time",
         "17 numbers",
         "radians",
         "time, by columns",
@@ -519,7 +525,7 @@ def test_poses_near_a_folder_are_those_at_its_times(tmp_path) -> None:
     with pytest.warns(CFlowWarning, match="its poses are those of .*truth.*poses.csv"):
         assert ArraysLog(folder).poses[:, 0, 3].tolist() == list(range(12))
     (tmp_path / "global.txt").write_text("\n".join(EXACT))
-    with pytest.warns(CFlowWarning, match="global.txt and .*poses.csv: choose one with data.poses"):
+    with pytest.warns(CFlowWarning, match="choose data.poses=.*global.txt or .*poses.csv"):
         assert ArraysLog(folder).poses is None
 
 
@@ -1032,6 +1038,18 @@ def test_poses_of_seven_numbers_in_json_are_read(tmp_path, order, is_from_origin
     assert np.allclose(poses_text.read_poses(tmp_path / "poses.json").poses, np.delete(poses, 3, axis=0))
 
 
+@pytest.mark.parametrize("order", ["w first", "w last", "w last, rolled", "w last, of a camera"])
+def test_the_order_of_a_quaternion_without_names_follows_from_the_rotations(tmp_path, order) -> None:
+    """FAST-LIVO2 and CODa write w first. A vehicle and a tilted sensor turn about z, a camera about y."""
+    axis, roll = (1, 0.0) if order.endswith("camera") else (2, 0.3 * order.endswith("rolled"))
+    poses = as_matrix(rotations_about(axis, 0.02 * np.arange(12)) @ rotations_about(0, roll), POSES[:, :3, 3])
+    quaternions = np.roll(to_quaternions(poses[:, :3, :3]), 0 if order == "w first" else -1, 1)
+    table = np.column_stack([np.arange(12), poses[:, :3, 3], quaternions])
+    for numbers in (table, table[:, 1:], np.column_stack([np.arange(12), table])):
+        np.savetxt(tmp_path / "poses.txt", numbers, "%.17g")
+        assert np.allclose(poses_text.read_poses(tmp_path / "poses.txt").poses, poses), numbers.shape
+
+
 def test_quaternions_of_one_length_are_normalised(tmp_path) -> None:
     table = np.concatenate([POSES[:, :3, 3], 1000 * np.roll(to_quaternions(POSES[:, :3, :3]), -1, 1)], axis=1)
     np.savetxt(tmp_path / "poses.csv", table, "%.9f", ",", header="x,y,z,qx,qy,qz,qw", comments="")
@@ -1040,3 +1058,63 @@ def test_quaternions_of_one_length_are_normalised(tmp_path) -> None:
     np.savetxt(tmp_path / "poses.csv", table, "%.9f", ",", header="x,y,z,qx,qy,qz,qw", comments="")
     with pytest.raises(CFlowError, match="not a rigid motion"):
         poses_text.read_poses(tmp_path / "poses.csv")
+
+
+JSON_TEXTS = {
+    "a line per pose": "\n".join(json.dumps({"k": k, "T": pose.tolist()}) for k, pose in enumerate(POSES)),
+    "numbers": "\n".join(rows([(*pose[:3, 3], *q) for q, pose in zip(QUATERNIONS, POSES)])),
+    "a rotation and a translation": json.dumps(
+        [{"rotation": T[:3, :3].tolist(), "translation": T[:3, 3:].tolist()} for T in POSES]
+    ),
+}
+
+
+@pytest.mark.parametrize("form", JSON_TEXTS)
+def test_files_of_json_may_hold_lines_and_rotations_of_nine_numbers(tmp_path, form) -> None:
+    """FAST-LIVO2 and HBA, objects in lines, DAIR-V2X."""
+    (tmp_path / "poses.json").write_text(JSON_TEXTS[form])
+    assert np.allclose(poses_text.read_poses(tmp_path / "poses.json").poses, POSES)
+
+
+def test_objects_of_other_keys_in_lines_are_one_object(tmp_path) -> None:
+    """View-of-Delft has a file per sweep with a matrix in each line."""
+    names = ("odomToCamera", "mapToCamera")
+    text = "\n".join(json.dumps({name: pose.reshape(-1).tolist()}) for name, pose in zip(names, POSES))
+    (tmp_path / "pose.json").write_text(text)
+    assert poses_text.read_poses(tmp_path / "pose.json").labels == ["mapToCamera", "odomToCamera"]
+
+
+@pytest.mark.parametrize(
+    ("files", "told"),
+    [
+        ({"results/a/x_poses_kitti.txt": "matrices"}, "choose data.poses=results/a/x_poses_kitti.txt"),
+        ({f"novatel/data/{k:02d}.txt": "1 2 3 4 5\n" for k in range(12)}, r"novatel/data \(it/00.txt has 5 numbers"),
+        ({"scene.pkl": "pose"}, r"scene.pkl \(pickles are not read\)"),
+        ({"../scene.json": '{"rotation": 1, "translation": 2}'}, r"scene.json \(it has no list of poses"),
+        ({f"calib/to_camera/{k:02d}.json": json.dumps({"pose": np.eye(4).tolist()}) for k in range(12)}, None),
+        ({"../other/maps/poses.txt": "matrices"}, None),
+        ({f"../novatel/data/{k:02d}.txt": "1 2 3 4 5\n" for k in range(12)}, "novatel/data .*has 5 numbers"),
+        ({f"labels/{k:02d}.txt": "car 1 2 3 4 5\n" for k in range(12)}, None),
+    ],
+)
+def test_poses_that_are_not_used_are_told(tmp_path, files, told) -> None:
+    log_folder = tmp_path / "run" / "drive"
+    clouds(log_folder / "points", [f"{k:02d}" for k in range(12)])
+    matrices = "\n".join(rows([pose[:3].reshape(-1) for pose in POSES]))
+    for name, text in files.items():
+        (log_folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (log_folder / name).write_text(matrices if text == "matrices" else text)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        log = ArraysLog(log_folder)
+    texts = [str(each.message) for each in caught]
+    assert log.poses is None and len(texts) == (told is not None)
+    assert told is None or re.search(told, texts[0]), texts
+
+
+def test_a_relative_path_is_also_looked_for_above_the_log(tmp_path) -> None:
+    folder = clouds(tmp_path / "given" / "frames")
+    (tmp_path / "given" / "x.txt").write_text("\n".join(EXACT))
+    assert ArraysLog(folder, poses="x.txt").poses[:, 0, 3].tolist() == list(range(12))
+    with pytest.raises(CFlowError, match="neither here nor in .*frames or above it"):
+        ArraysLog(folder, poses="y.txt")

@@ -189,8 +189,7 @@ def copy_rows(source: PathLike, target: PathLike, is_kept: np.ndarray, layout: B
             arrays: Any = _plain_arrays(content).items()
             np.savez(file, **{k: v[is_kept] if v.shape[:1] == is_kept.shape else v for k, v in arrays})
         elif suffix == ".bin":
-            step = _layout_of(content, layout).step
-            file.write(np.frombuffer(content, np.uint8).reshape(-1, step)[is_kept].tobytes())
+            file.write(_layout_of(content, layout).rows(content, is_kept))
         elif suffix == ".ply":
             file.write(ply_bytes({name: values[is_kept] for name, values in ply_fields(content).items()}))
         else:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any, Callable, Container, Dict, List, Mapping, Sequence
+from typing import Any, Callable, Container, Dict, Iterator, List, Mapping, Sequence
 
 import numpy as np
 
@@ -16,7 +17,8 @@ from cflow_torch.data.arrays.cloud_file import SUFFIXES, TABLES, may_be_cloud, n
 from cflow_torch.data.arrays.poses_text import STRUCTURED, files_of_poses, parse_poses, parse_times, read_poses
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.column_names import are_of_poses
-from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.file_errors import file_errors, shortened
+from cflow_torch.data.finding import CHOOSE, UNREAD
 from cflow_torch.data.folders import find_folders, natural_key, record_in, visible
 from cflow_torch.data.paths import PathLike, as_path, is_remote, read_start, stem_of, suffix_of
 from cflow_torch.data.trajectory import Trajectory
@@ -34,10 +36,12 @@ SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
 # Words in names of files of poses near a log, or whole names of their folders.
 _WORDS = {"poses", "pose", "trajectory", "trajectories", "odometry", "odom", "gt", "groundtruth"}
+_LIKE_POSES = {*_WORDS, "ego", "novatel", "oxts", "ins"}  # words in names of what may hold poses in another form
 # Suffixes of files that we test for poses and times.
 _TABLES = (".txt", ".csv", ".tum", ".log", ".g2o", ".json", ".jsonl", ".yaml", ".yml", ".npy")
 _NEAR_TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test in other folders
 _FIRST_UNIX, _MOST = 10**17, 50  # nanoseconds in 1973; files or folders
+_LONGEST = 150  # characters of a reason
 _MOST_EXACT = 0.5  # a file with poses at exactly the times of more than this share of the sweeps is preferred
 _TESTED = 8192  # bytes of a file that tell what it holds
 _FEWEST_POINTS = 20  # lines at the start of a text that may be a cloud
@@ -45,6 +49,7 @@ _MOST_MAPS = 10  # clouds in a log's folder that may be maps, if a folder below 
 _LARGEST = 1 << 24  # bytes; structured files must be whole to be read, and poses take less
 # Numbers in names of files that count: not one or two digits behind letters, as in lidar0_000001.
 _COUNTERS = re.compile(r"(?<![A-Za-z\d])\d+|(?<=\d[A-Za-z])\d+|\d{3,}|\d+$")
+_TOKEN = re.compile(r"[0-9a-f]{16,}|[0-9a-f]{8}(-[0-9a-f]{4,12}){4}", re.IGNORECASE)  # hashes and random identifiers
 
 _Kinds = Dict[str, List[Path]]  # clouds of each suffix, or of each pattern of names
 
@@ -214,6 +219,12 @@ def find_clouds(folder: Path, suffix: str | None) -> list[Path]:
     if twice is not None:
         raise CFlowError(f"{parent} has several files of one name, such as {twice.name}: leave one of each")
     stamps = times_of_names([stem_of(path) for path in files])
+    are_tokens = all(_TOKEN.fullmatch(stem_of(path)) for path in files)
+    if are_tokens and 2 * sum(stem_of(path).isdecimal() for path in files) < len(files):
+        raise CFlowError(
+            f"the names of the clouds in {parent}, such as {files[0].name}, have no order: number them by their times "
+            "(in nuPlan, these are in its .db)"
+        )
     return files if stamps is None else [files[k] for k in np.argsort(stamps, kind="stable")]
 
 
@@ -225,10 +236,14 @@ def resolve(folder: Path, setting: PathLike | None, names: Sequence[str], what: 
         found = [parent for parent in (folder / name for name in names) if parent.exists()]
         return only_one(found, folder, what)
     path = as_path(setting)
-    path = path if is_remote(path) or path.is_absolute() or path.exists() else folder / path
-    if not path.exists():
-        raise CFlowError(f"{what}={str(setting)!r} does not exist, neither here nor in {folder}")
-    return path
+    if is_remote(path) or path.is_absolute() or path.exists():
+        places = [path]
+    else:  # the user gave the folder or one above
+        places = [parent / path for parent in (folder, *islice(folder.resolve().parents, SEARCH_DEPTH))]
+    existing = [place for place in places if place.exists()]
+    if not existing:
+        raise CFlowError(f"{what}={str(setting)!r} does not exist, neither here nor in {folder} or above it")
+    return existing[0]
 
 
 def only_one(found: Sequence[Path], folder: Path, what: str) -> Path | None:
@@ -338,12 +353,79 @@ def find_poses_near(
             own += [file] if is_own else []
     found = {file: each for file, each in read_all(known, read_poses, tell).items() if fits(each)}
     files = _preferred(found, own, times_ns)
-    names = " and ".join(found[file].source for file in files)
     if len(files) == 1:
-        tell("" if files[0].stem == name else f"its poses are those of {names}")
+        tell("" if files[0].stem == name else f"its poses are those of {found[files[0]].source}")
         return found[files[0]]
-    tell(f"there are poses of its sweeps in {names}: choose one with data.poses=FILE" if files else "")
+    tell(_choice([found[file].source for file in files]) if files else "")
     return None
+
+
+def _choice(files: Sequence[Any]) -> str:
+    return f"there are poses of its sweeps: {CHOOSE}{' or '.join(map(str, files))}"
+
+
+def tell_unused_poses(
+    folder: Path, clouds: Sequence[Path], fits: Callable[[Trajectory], bool], tell: Callable[[str], None]
+) -> None:
+    """Tell which files may hold the poses of a log without poses, by their names or contents, and why none is used."""
+    if is_remote(folder):
+        return
+    fitting, unread = [], []
+    for path in islice(_like_poses(folder, clouds), _MOST):
+        name = os.path.relpath(path, folder.resolve())
+        try:
+            if suffix_of(path) == ".pkl":
+                raise CFlowError("pickles are not read")
+            poses = read_poses(path)
+        except CFlowError as error:
+            unread.append(f"{name} ({shortened(str(error).replace(str(path), 'it'), _LONGEST)})")
+            continue
+        is_calibration = len(poses.poses) > 1 and np.ptp(poses.poses, axis=0).max() == 0
+        if fits(poses) and not is_calibration:
+            fitting.append(name)
+        elif not is_calibration:
+            unread.append(f"{name} (its number of poses is {len(poses.poses)}, of sweeps {len(clouds)})")
+    if fitting:
+        tell(_choice(fitting))
+    elif unread:
+        tell(f"{UNREAD} {' or '.join(unread[:2])}")
+
+
+def _like_poses(folder: Path, clouds: Sequence[Path]) -> Iterator[Path]:
+    """Yield files and folders of a file per sweep that are called like poses, or are structured and contain such words.
+
+    They lie in the folder of a log, two levels above or below it, or next to it in a folder that is called so.
+    """
+    stems = {stem_of(path) for path in clouds}
+    top = folder.resolve()
+    pending = [*zip((top, *top.parents), (0, 0, 2))]  # folders, and their depth
+    seen = {path.resolve() for path in clouds}
+    for place, depth in pending:
+        inside = [path for path in sorted(visible(place)) if path.resolve() not in seen]
+        files = [path for path in inside if suffix_of(path) in (*_TABLES, *STRUCTURED, ".pkl")]
+        seen.update(path.resolve() for path in inside)
+        of_sweeps = [path for path in files if stem_of(path) in stems]
+        if 2 * len(of_sweeps) > len(stems):  # a file per sweep
+            files = [path for path in files if path not in of_sweeps]
+            if _is_like_poses(of_sweeps[0], f"{place.parent.name} {place.name}"):
+                yield place if files_of_poses(place) else of_sweeps[0]
+        yield from (path for path in files[:_MOST] if _is_like_poses(path))
+        below = [path for path in inside if path.is_dir() and _holds_no_labels(path)][:_MOST]
+        if top not in (place, *place.parents):  # folders next to the log may be other logs
+            below = [path for path in below if _is_called_like_poses(f"{place.name} {path.name}")]
+        pending += [(path, depth + 1) for path in below if depth < 2]
+
+
+def _is_like_poses(file: Path, folder: str = "") -> bool:
+    start = b""
+    with suppress(CFlowError), file_errors(file):
+        start = read_start(file, _TESTED).lower() if suffix_of(file) in (*STRUCTURED, ".pkl") else b""
+    has_words = b"pose" in start or (b"rotation" in start and b"translation" in start)
+    return has_words or _is_called_like_poses(f"{folder} {file.stem}")
+
+
+def _is_called_like_poses(name: str) -> bool:
+    return not _LIKE_POSES.isdisjoint(re.split("[^a-z]+", name.lower()))
 
 
 def _has_one(file: Path, names: Sequence[str]) -> bool:

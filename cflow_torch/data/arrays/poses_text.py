@@ -11,7 +11,7 @@ import numpy as np
 
 from cflow_torch.data.arrays.stamps import nanoseconds_of_numbers
 from cflow_torch.data.arrays.tables import MATRIX, Table, parse_table, tables_of_values
-from cflow_torch.data.column_names import role_of_name
+from cflow_torch.data.column_names import role_of_name, roles_of_names
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key, visible
 from cflow_torch.data.npy_file import read_npy
@@ -22,10 +22,13 @@ from cflow_torch.types import CFlowError
 
 _POSITION, _ANGLES = ("x", "y", "z"), ("roll", "pitch", "yaw")
 _QUATERNION = ("qw", "qx", "qy", "qz")
-_ROTATIONS = {*MATRIX[0:3], *MATRIX[4:7], *MATRIX[8:11], *_QUATERNION, "q0", "q1", "q2", "q3"}  # not all are zero
+_ANY_ORDER, _W_LAST = ("q0", "q1", "q2", "q3"), ("qx", "qy", "qz", "qw")
+_ROTATIONS = {*MATRIX[0:3], *MATRIX[4:7], *MATRIX[8:11], *_QUATERNION, *_ANY_ORDER}  # not all are zero
 _TIMES = {"time", "sec", "nsec"}
-_LEAST_W = 0.02  # mean of w, if it is the first of four numbers without names
-_TUM = ("time", *_POSITION, "qx", "qy", "qz", "qw")
+# Mean of w, if it is the first of q0 to q3, and of numbers without any name, which are mostly TUM's (x of a roll of 23
+# degrees). Of one pose without names, w is last.
+_LEAST_W, _LEAST_W_UNNAMED = 0.02, 0.2
+_TUM = ("time", *_POSITION, *_ANY_ORDER)
 _UNNAMED = {
     7: _TUM[1:],
     8: _TUM,
@@ -36,12 +39,12 @@ _UNNAMED = {
     17: ("time", *MATRIX),
 }
 """What columns without names hold, by their number."""
-_QUATERNION_FIRST = ("q0", "q1", "q2", "q3", *_POSITION)  # 7 numbers, or 8 with the time, whose last four are none
-_OF_LISTS = dict(zip(_TUM[4:], _QUATERNION_FIRST))
+_QUATERNION_FIRST = (*_ANY_ORDER, *_POSITION)  # 7 numbers, or 8 with the time, whose last four are none
 _UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four are not a quaternion; 6 have no time
 STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz", ".npy")
 """Suffixes of files that must be whole to be read, see `tables_of_values`."""
 _IN_ORDER = "write all digits, a line per sweep, in the order of their times"
+_STARTS_WITH_NUMBERS = re.compile(rb"\s*[-+.\d]+[eE\d+-]*[ \t,]+[-+.\d]")  # a text, whatever its name
 _INVERSE = ("extrinsic", "world2", "world_to", "w2c")  # in names of matrices that map the world to the sensor
 
 
@@ -51,7 +54,7 @@ def read_poses(path: PathLike) -> Trajectory:
     Args:
         path: a file of text, of `STRUCTURED`, or `.npy` with (K, 4, 4), (K, 3, 4) or the numbers of K lines; or a
             folder with a file per pose. A line of text has 12 numbers (KITTI: upper three rows of the matrix), 8 (TUM:
-            time in seconds, tx ty tz, qx qy qz qw, the scalar LAST), 7 (without the time), 16 (the matrix by rows, or
+            time in seconds, tx ty tz, qx qy qz qw), 7 (without the time), 16 (the matrix by rows, or
             by columns), 13 or 17 (a time before the matrix), or 9 (the number of the row before TUM). In 7 and 8, the
             quaternion may come before x y z. 7 numbers without a quaternion are a time, x y z, roll pitch yaw; 6 have
             no time. Four lines may have a matrix, below a line of three numbers (Open3D). The last number of matrices
@@ -61,8 +64,9 @@ def read_poses(path: PathLike) -> Trajectory:
             `nanoseconds_of_numbers`.
 
     Convention: yaw turns x to y, pitch then z to x, roll then y to z. What is not named of z, roll and pitch is 0. The
-        angles are degrees if their name says so, or one is larger than 2 pi, else radians. A quaternion q0 to q3 has w
-        first or last, as a vehicle turns mostly about z. Matrices called extrinsic or world to camera are inverted.
+        angles are degrees if their name says so, or one is larger than 2 pi, else radians. A quaternion q0 to q3, or
+        without names, has w first or last, as a vehicle turns mostly about z. Matrices called extrinsic or world to
+        camera are inverted.
     """
     path = as_path(path)
     if path.is_dir():
@@ -90,7 +94,7 @@ def parse_poses(content: bytes, path: Path) -> Trajectory:
         if numbers.ndim == 2 and numbers.shape[1] in _UNNAMED and numbers.dtype.kind in "fiu":
             return _poses_of_table(Table([], numbers.astype(str), []), path)
         return Trajectory(checked_poses(numbers, str(path)), None, False, str(path))
-    if suffix_of(path) not in STRUCTURED:
+    if suffix_of(path) not in STRUCTURED or _STARTS_WITH_NUMBERS.match(content):
         return _poses_of_table(parse_table(content, path), path)
     error = CFlowError(f"{path} has no list of poses: matrices of 16 or 12 numbers, or positions and rotations")
     found = []
@@ -112,7 +116,7 @@ def _with_sevens(table: Table) -> Table:
         columns = [names.index(f"{stem}{k}") for k in range(8) if f"{stem}{k}" in names]
         roles = _layout(table.words[:, columns], False) if len(columns) == 7 else ()
         for column, role in zip(columns, roles if "time" not in roles else ()):
-            names[column] = _OF_LISTS.get(role, role)
+            names[column] = role
     return table._replace(names=names)
 
 
@@ -158,6 +162,8 @@ def _layout(words: np.ndarray, have_names: bool) -> Sequence[str]:
     if count == 9:
         counts_rows = (np.diff(words[:, 0].astype(np.float64)) == 1).all()
         return usual if counts_rows else ()
+    if count == 13 and _are_matrices(words[:, :12]) and not _are_matrices(words[:, 1:]):
+        return (*MATRIX[:12], "time")
     if count == 16:
         ends_with_1 = (words[:, 15].astype(np.float64) == 1).all()
         has_time = not ends_with_1 and _are_homogeneous(words[:, 12:])
@@ -179,6 +185,12 @@ def _are_homogeneous(rows: np.ndarray) -> bool:
     return not numbers[:, :3].any() and bool((last == 1).all() or (len(last) > 1 and (np.diff(last) > 0).all()))
 
 
+def _are_matrices(words: np.ndarray) -> bool:
+    rotations = words.astype(np.float64).reshape(-1, 3, 4)[:, :, :3]
+    errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    return bool(np.nanmedian(errors) < 0.1)
+
+
 def _are_quaternions(words: np.ndarray) -> bool:
     norms = np.linalg.norm(words.astype(np.float64), axis=1)
     return bool(np.nanmedian(np.abs(norms - 1)) < 0.1)
@@ -187,16 +199,15 @@ def _are_quaternions(words: np.ndarray) -> bool:
 def _roles(names: Sequence[str]) -> dict[str, int]:
     """Return the columns of the position, rotation and time that names tell; {} = they do not tell a pose."""
     first: dict[str, int] = {}
+    roles = roles_of_names(names)
     for column, name in sorted(enumerate(names), key=lambda named: "stamp" not in named[1].lower()):  # not of arrival
         last = name.rpartition(".")[2]
-        role = last if last in MATRIX else role_of_name(name)
+        role = last if last in MATRIX else roles[column]
         if role is not None:
             first.setdefault(role, column)
     if "sec" in first and "nsec" not in first:
         first.setdefault("time", first.pop("sec"))
-    has_rotation = any(
-        set(group) <= set(first) for group in ({"z", *_QUATERNION}, {"z", "q0", "q1", "q2", "q3"}, {"yaw"})
-    )
+    has_rotation = any(set(group) <= set(first) for group in ({"z", *_QUATERNION}, {"z", *_ANY_ORDER}, {"yaw"}))
     has_position = {"x", "y"} <= set(first) or {"latitude", "longitude"} <= set(first)
     return first if MATRIX[0] in first or (has_position and has_rotation) else {}
 
@@ -217,9 +228,11 @@ def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.
     positions = np.stack([values.get(axis, zeros) for axis in _POSITION], axis=1)
     if "q0" in values and not set(_QUATERNION) <= set(values):
         # A vehicle hardly rolls or pitches: if w comes first, the two in the middle are small, else the first two, and
-        # also the third while its heading is that of the start.
-        q0, q2 = (np.abs(values[name]).mean() for name in ("q0", "q2"))
-        values.update(zip(_QUATERNION if q0 > max(q2, _LEAST_W) else _TUM[4:], (values[f"q{k}"] for k in range(4))))
+        # also the third while its heading is that of the start. A camera turns about the second if w comes last.
+        w, *middle = (np.abs(values[name]).mean() for name in _ANY_ORDER[:3])
+        of_unnamed = _LEAST_W_UNNAMED if len(words) > 1 else 1.0
+        is_first = w > max(*middle, _LEAST_W if names else of_unnamed)
+        values.update(zip(_QUATERNION if is_first else _W_LAST, (values[name] for name in _ANY_ORDER)))
     if set(_QUATERNION) <= set(values):
         quaternions = np.stack([values[name] for name in _QUATERNION], axis=1)
         length: np.ndarray = np.linalg.norm(quaternions, axis=1)

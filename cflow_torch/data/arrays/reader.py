@@ -21,11 +21,13 @@ from cflow_torch.data.arrays.folder import (
     other_folders,
     read_all,
     resolve,
+    tell_unused_poses,
 )
 from cflow_torch.data.arrays.pcd import LONGEST_HEADER, pcd_viewpoint
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.calibration import CAMERA_KEYS, read_calibration, transform
 from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.finding import CHOOSE
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.log import Log
 from cflow_torch.data.log_motion import fits_better
@@ -193,6 +195,8 @@ class ArraysLog(Log):
         if poses == "auto":
             found = find_poses(self.folder, self.files, stamps, partial(self._fits, stamps), self._note)
             trajectory = found or self._viewpoints()
+            if trajectory is None and not any(CHOOSE in note for note in self.notes):
+                tell_unused_poses(self.folder, self.files, partial(self._fits, stamps), self._note)
         else:
             file = resolve(self.folder, poses, (), "poses")
             trajectory = None if file is None else poses_text.read_poses(file)

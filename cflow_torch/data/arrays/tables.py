@@ -144,7 +144,20 @@ def _value_of(content: bytes, path: Path) -> Any:
             documents = list(yaml.load_all(text, getattr(yaml, "CBaseLoader", yaml.BaseLoader)))
             return _as_decimals(documents[0] if len(documents) == 1 else documents)
         parse = partial(json.loads, parse_float=Decimal, parse_int=Decimal)
-        return list(map(parse, text.splitlines())) if kind == ".jsonl" else parse(text)
+        try:
+            value = None if kind == ".jsonl" else parse(text)
+        except json.JSONDecodeError as error:
+            if not error.msg.startswith("Extra data"):
+                raise
+            value = None
+        return _of_lines(list(map(parse, text.splitlines()))) if value is None else value
+
+
+def _of_lines(values: list[Any]) -> Any:
+    """Return the values of lines as a list, but objects of distinct keys as one object."""
+    keys = [key for value in values if isinstance(value, dict) for key in value]
+    are_parts = len(values) > 1 and len(set(keys)) == len(keys) and all(isinstance(value, dict) for value in values)
+    return {key: member for value in values for key, member in value.items()} if are_parts else values
 
 
 def _as_decimals(value: Any) -> Any:
@@ -195,6 +208,13 @@ def _numbers_of(value: Any, name: str) -> Iterator[tuple[str, str]]:
         ends = MATRIX if len(numbers) in (12, 16) else _VECTORS.get(kind, range(len(numbers)))
         yield from ((f"{name}.{end}".lstrip("."), str(number)) for end, number in zip(ends, numbers))
     elif isinstance(value, dict):
+        parts = [(key, _numbers(member)) for key, member in value.items()]
+        rotations = [numbers for _, numbers in parts if len(numbers) == 9]
+        positions = [numbers for key, numbers in parts if (len(numbers), role_of_name(f"{key}.x")) == (3, "x")]
+        if len(rotations) == len(positions) == 1:  # the rows of a matrix
+            rows = [(*rotations[0][3 * k : 3 * k + 3], positions[0][k]) for k in range(3)]
+            value = {key: member for (key, numbers), member in zip(parts, value.values()) if len(numbers) not in (3, 9)}
+            value["matrix"] = [number for row in rows for number in row]
         for key, member in value.items():
             yield from _numbers_of(member, f"{name}.{key}" if name else key)
 
