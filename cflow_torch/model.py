@@ -37,7 +37,7 @@ class Motion:
     moving: Tensor | None = None  # (M + 1,) float32, likewise
     # (A, P) float64, metres per sweep interval, flow of each point summed over coarser scales; None = no coarser scale.
     before: Tensor | None = None
-    corrected: Batch | None = None  # the batch with the ego motion that the method corrected; None = it is as given
+    corrected: Batch | None = None  # the batch with the ego motion that the method found; None = it takes that given
 
     def cluster(self, points: slice) -> Tensor:
         """Return the cluster of each point in a slice; M = no cluster."""

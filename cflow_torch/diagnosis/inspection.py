@@ -51,9 +51,10 @@ _OTHER_TIME = (
     "or sweeps are interchanged"
 )
 _CORRECTED = (
-    "the flow has them corrected by the static world, here and in other pairs; for maps and tracks, "
-    "data.odometry=refine corrects the poses of the whole log"
+    "so the poses are off: the flow has such errors corrected; for maps and tracks, data.odometry=refine corrects the "
+    "poses of the whole log"
 )
+_WITHOUT_POSES = "and there are no poses: the flow has such motion removed; give poses, or data.odometry=true"
 _MOST_COMPARED, _LEAST_CORRECTION = 64, 1e-3  # points, metres; the pose flow is rounded
 # A share of moving points is suspicious if it is this many times larger than the usual one and a slack.
 _SUSPICIOUS, _SLACK, _FEWEST_WATCHED = 1.5, 0.05, 500
@@ -198,10 +199,11 @@ class MotionWatch:
         """Return what is wrong with the next pair of the log; "" = nothing. Corrected poses are told once."""
         problem = self._other_time(window, result)
         error = 0.0 if problem or self._has_told_error else pose_error(window, result)
-        if error:
-            self._has_told_error = True
-            return f"the poses are off by up to {100 * error:.0f} cm between two sweeps: {_CORRECTED}"
-        return problem
+        if not error:
+            return problem
+        self._has_told_error = True
+        what = f"the static world moves by up to {100 * error:.0f} cm between two sweeps"
+        return f"{what}, {_WITHOUT_POSES if window.pc0.pose is None else _CORRECTED}"
 
     def _other_time(self, window: Window, result: FlowResult) -> str:
         """Return that a sweep or pose of the pair is of another time; "" = it is not."""

@@ -10,7 +10,7 @@ t+1 as if it was one object. If a sweep matches clearly better, its correction b
         corrected           moves the points, the origins of the sweeps and the pose flow
         draw                the moved points
 
-With good poses, the first registration is all that happens, and every number stays the same.
+If no sweep matches better, every number stays the same.
 """
 
 from __future__ import annotations
@@ -69,8 +69,17 @@ def corrections(sweeps: HeightSlicedSweeps) -> RigidMotion | None:
     if not bool(is_likely.any()):
         return None
     motion, gains = _register(sweeps, _MORE, _MORE_ITERATIONS)
-    is_clear = is_likely & gains.are_clear()
-    return motion.only(is_clear) if bool(is_clear.any()) else None
+    motion = motion.only(is_likely & gains.are_clear())
+    return _alike_at_t(motion, sweeps.batch) if bool(motion.flow.any()) else None
+
+
+def _alike_at_t(motion: RigidMotion, batch: Batch) -> RigidMotion:
+    """Give sweep t of the windows of later sweeps (`Batch`) the motion that it has in those of earlier ones."""
+    window = torch.arange(batch.num_windows, device=motion.flow.device)
+    image = torch.arange(len(motion.flow), device=window.device).view(batch.num_windows, -1).clone()
+    image[:, 1] = (window % len(batch.rows)) * batch.num_steps + 1
+    flow, rotation, centre = (values[image.view(-1)] for values in (motion.flow, motion.rotation, motion.centre))
+    return RigidMotion(flow, rotation, centre)
 
 
 class Gains(NamedTuple):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from scenes import assert_same_bits, pose, sweeps_of
 
 from cflow_torch import Sweep, VerifiedFlow, Window, estimate_flow
 from cflow_torch.config import VerifiedConfig
-from cflow_torch.diagnosis.inspection import pose_error
+from cflow_torch.diagnosis.inspection import MotionWatch, pose_error
 from cflow_torch.errors import CFlowWarning
 from cflow_torch.transforms import relative_transform, transform_points
 from cflow_torch.verified import alignment
@@ -119,9 +121,31 @@ def test_blocks_vote():
 
 
 def test_a_correction_is_told_once():
-    window = drive(NOISY)
+    window, watch = drive(NOISY), MotionWatch()
     (result,) = VerifiedFlow(MODEL)([window])
     assert 0.05 < pose_error(window, result) < 0.5
+    assert "so the poses are off" in watch(window, result) and watch(window, result) == ""
     assert pose_error(drive(EXACT), VerifiedFlow(MODEL)([drive(EXACT)])[0]) == 0
-    with pytest.warns(CFlowWarning, match="the poses are off by up to"):
+    with pytest.warns(CFlowWarning, match="so the poses are off"):
         estimate_flow(window.pc0, window.pc1, preset=MODEL, ground=None)
+
+
+def test_a_sensor_without_poses_may_move_a_little():
+    """All points should be in the frame of t+1, but are 8 cm off."""
+    window = drive(EXACT).with_sweeps([replace(sweep, pose=None) for sweep in drive(EXACT).sweeps])
+    shifted = window.pc1.points - np.float32((0.08, 0, 0))
+    T_ego1_ego0 = np.linalg.inv(pose(0.3, 0.0, 0.02))
+    at_t = transform_points(window.pc0.points, T_ego1_ego0).astype(np.float32)
+    window = Window(replace(window.pc0, points=at_t), replace(window.pc1, points=shifted))
+    (result,) = VerifiedFlow(MODEL)([window])
+    assert not result.residual_flow[: CAR.start].any()
+    assert torch.allclose(result.pose_flow.median(0).values, torch.tensor([-0.08, 0.0, 0.0]), atol=0.01)
+    assert "there are no poses" in MotionWatch()(window, result)
+
+
+def test_both_sides_of_a_recording_have_one_motion_of_t():
+    """With later sweeps, t is in a window of each side."""
+    batch = make_batch([drive(NOISY)], MODEL, VerifiedFlow(MODEL).grid(0.1), torch.device("cpu"), 3)
+    motion = RigidMotion(torch.arange(12.0).view(6, 2), torch.arange(6.0), torch.zeros(6, 2))
+    alike = alignment._alike_at_t(motion, replace(batch, num_windows=2, num_steps=3))
+    assert alike.flow[:, 0].tolist() == [0, 2, 4, 6, 2, 10] and alike.rotation.tolist() == [0, 1, 2, 3, 1, 5]
