@@ -39,11 +39,11 @@ _MOST_ROUNDS = 3  # a round corrects points by up to about 0.2 m
 # What a voxel must gain on average, as a share of a perfect match, and what all of them gain together, in standard
 # deviations of noise. Real drives with good poses gain 0.012 at most. With a noise of 2 cm and 0.1 degrees, they gain
 # 0.02 to 0.28.
-_LEAST_GAIN, _GAIN_Z = 0.01, 4.0
-# The blocks that gain must outnumber those that lose by three standard deviations. So it takes structure in ten of
-# them at least: a single vehicle does not become the world.
+_LEAST_GAIN, _GAIN_Z = 0.01, 3.0
+# Blocks whose gain exceeds its noise vote. Those that gain must outnumber those that lose by two standard deviations,
+# and be ten at least, so that a single vehicle does not become the world.
 _VOTING = 5.0  # metres, side of a block
-_VOTE_Z = 3.0
+_VOTE_Z, _FEWEST_BETTER = 2.0, 10
 
 
 def align(sweeps: HeightSlicedSweeps, draw: Callable[[Batch], HeightSlicedSweeps]) -> HeightSlicedSweeps:
@@ -65,11 +65,11 @@ def corrections(sweeps: HeightSlicedSweeps) -> RigidMotion | None:
     The B S motions are those of the images of the batch (`Batch.image`). None = no sweep matches clearly better.
     """
     _, gains = _register(sweeps, _FEW, _FEW_ITERATIONS)
-    is_likely = gains.are_likely()
+    is_likely = gains.are_likely().view(sweeps.batch.num_windows, -1).any(1)  # of each window
     if not bool(is_likely.any()):
         return None
     motion, gains = _register(sweeps, _MORE, _MORE_ITERATIONS)
-    motion = motion.only(is_likely & gains.are_clear())
+    motion = motion.only(is_likely.repeat_interleave(sweeps.num_steps) & gains.are_clear())
     return _alike_at_t(motion, sweeps.batch) if bool(motion.flow.any()) else None
 
 
@@ -87,8 +87,8 @@ class Gains(NamedTuple):
 
     mean: Tensor  # (B S,) float64, of its voxels, see `Registration.gains`; NaN without any
     z: Tensor  # (B S,) float64, their sum over the root of the sum of their squares
-    num_better: Tensor  # (B S,) int64, blocks of 5 m whose voxels together gain
-    num_worse: Tensor  # (B S,) int64, and lose
+    num_better: Tensor  # (B S,) int64, blocks of 5 m whose voxels together gain more than the noise of their sum
+    num_worse: Tensor  # (B S,) int64, and lose more
 
     def are_likely(self) -> Tensor:
         """Tell which gains are large enough, (B S,) bool."""
@@ -97,7 +97,8 @@ class Gains(NamedTuple):
     def are_clear(self) -> Tensor:
         """Tell which gains are large enough, and those of most blocks, (B S,) bool."""
         noise = (self.num_better + self.num_worse).double().sqrt()
-        return self.are_likely() & (self.num_better - self.num_worse > _VOTE_Z * noise)
+        is_majority = self.num_better - self.num_worse > _VOTE_Z * noise
+        return self.are_likely() & is_majority & (self.num_better >= _FEWEST_BETTER)
 
 
 def _register(sweeps: HeightSlicedSweeps, most: int, num_iterations: int) -> tuple[RigidMotion, Gains]:
@@ -117,13 +118,15 @@ def _register(sweeps: HeightSlicedSweeps, most: int, num_iterations: int) -> tup
     lattice = sweeps.grid.lattice(side)
     row, col = floor_divide(voxels.place[2:].index_select(1, source.voxel), side)
     blocks = Groups(lattice.cell(source.by_object.of_item, row, col), count * lattice.area)
-    of_block = blocks.sum(gain).view(count, -1)
-    total, square = source.by_object.sum(torch.stack((gain, gain.square())))
+    both = torch.stack((gain, gain.square()))
+    of_block, of_noise = blocks.sum(both).view(2, count, -1)
+    of_noise = of_noise.sqrt()
+    total, square = source.by_object.sum(both)
     return motion, Gains(
         mean=total / source.by_object.size(),
         z=total / square.sqrt(),
-        num_better=(of_block > 0).sum(1),
-        num_worse=(of_block < 0).sum(1),
+        num_better=(of_block > of_noise).sum(1),
+        num_worse=(of_block < -of_noise).sum(1),
     )
 
 
