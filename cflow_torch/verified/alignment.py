@@ -1,7 +1,7 @@
 """Alignment: correct the ego motion where poses are off by centimetres or tenths of a degree.
 
-Such poses move the whole static world, in each sweep otherwise. So before all other steps, we register every sweep with
-t+1 as if it was one object. If a sweep matches clearly better, its correction becomes a part of the ego motion:
+Such poses move the whole static world, differently in each sweep. So right after drawing, we register every other sweep
+with t+1 as if it were one object. If a sweep then matches clearly better, we correct its ego motion:
 
     align               repeatedly, until no sweep matches better
         corrections
@@ -76,7 +76,7 @@ def corrections(sweeps: HeightSlicedSweeps) -> RigidMotion | None:
 def _alike_at_t(motion: RigidMotion, batch: Batch) -> RigidMotion:
     """Give sweep t of the windows of later sweeps (`Batch`) the motion that it has in those of earlier ones."""
     window = torch.arange(batch.num_windows, device=motion.flow.device)
-    image = torch.arange(len(motion.flow), device=window.device).view(batch.num_windows, -1).clone()
+    image = torch.arange(len(motion.flow), device=window.device).view(batch.num_windows, -1)
     image[:, 1] = (window % len(batch.rows)) * batch.num_steps + 1
     flow, rotation, centre = (values[image.view(-1)] for values in (motion.flow, motion.rotation, motion.centre))
     return RigidMotion(flow, rotation, centre)
@@ -153,10 +153,8 @@ def corrected(batch: Batch, motion: RigidMotion, grid: Grid) -> Batch:
         grid: of the images. Points that leave it are not active.
     """
     positions = batch.positions.clone()
-    for points, window, step in batch.chunks:
-        image = torch.as_tensor(window * batch.num_steps + step, device=positions.device)
-        image = image.expand(points.stop - points.start)
-        positions[:2, points] += motion.flow_at(image, positions[:2, points]).t()
+    for points, _, _ in batch.chunks:
+        positions[:2, points] += motion.flow_at(batch.image[points].long(), positions[:2, points]).t()
     origin = batch.origin.clone().view(-1, 3)
     image = torch.arange(len(origin), device=origin.device)
     origin[:, :2] += motion.flow_at(image, origin[:, :2].t())
