@@ -280,7 +280,7 @@ class FlowResult:
     Args:
         residual_flow: (N, 3) float32, metres per sweep interval, axes of ego1: motion of objects.
         pose_flow: (N, 3) float32, metres, T_ego1_ego0 p - p: apparent motion that ego motion alone causes. The verified
-            method corrects ego motion that is clearly off, by up to about 0.2 m, and this is the corrected one.
+            method corrects ego motion that is off by centimetres, and this is the corrected one.
         flow: (N, 3) float32, metres, total flow, the sum of the two.
         cluster_id: (N,) int64, numbers from 0 on, in the order of each cluster's first pixel, some of which may be
             skipped; -1 = in no cluster that has points both at t+1 and before.

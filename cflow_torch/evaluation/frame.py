@@ -120,9 +120,9 @@ class EvalFrame:
             pose_flow = harness_pose_flow(points, stored_motion.T_ego1_ego0)
             parts.update(T_ego1_ego0=stored_motion.T_ego1_ego0, pose_flow=pose_flow, flow=pose_flow + residual)
             return cls(points=points, labels=labels, **parts)
-        if "T_ego1_ego0" not in parts:
+        # The labels have the ego motion of the given poses. `result.pose_flow` may be that of corrected ones.
+        if "T_ego1_ego0" not in parts:  # without poses, the ego vehicle does not move
             parts.setdefault("pose_flow", np.zeros_like(labels.flow))
-        # The pose flow of a result may be that of poses that the method corrected. The truth is that of the labels.
         parts.setdefault("residual_flow", result.residual_flow)
         return cls(points=window.pc0.points, labels=labels, **parts)
 

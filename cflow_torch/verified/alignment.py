@@ -3,9 +3,9 @@
 Such poses move the whole static world, differently in each sweep. So right after drawing, we register every other sweep
 with t+1 as if it were one object. If a sweep then matches clearly better, we correct its ego motion:
 
-    align               repeatedly, until no sweep matches better
+    align               up to three times, while a sweep matches better
         corrections
-            register        some structure of all sweeps. If a sweep matches better, we register more of it
+            register        some structure of all sweeps. If a sweep matches better, we register more structure
             are_clear       the blocks of 5 m vote
         corrected           moves the points, the origins of the sweeps and the pose flow
         draw                the moved points
@@ -88,7 +88,7 @@ class Gains(NamedTuple):
     mean: Tensor  # (B S,) float64, of its voxels, see `Registration.gains`; NaN without any
     z: Tensor  # (B S,) float64, their sum over the root of the sum of their squares
     num_better: Tensor  # (B S,) int64, blocks of 5 m whose voxels together gain more than the noise of their sum
-    num_worse: Tensor  # (B S,) int64, and lose more
+    num_worse: Tensor  # (B S,) int64, blocks that lose more than it
 
     def are_likely(self) -> Tensor:
         """Tell which gains are large enough, (B S,) bool."""
@@ -149,7 +149,7 @@ def corrected(batch: Batch, motion: RigidMotion, grid: Grid) -> Batch:
     """Return a batch with other ego motion.
 
     Args:
-        motion: of the B S images. The z of points stays.
+        motion: of the B S images. Heights stay, and so do the ground and the directions of the coverage.
         grid: of the images. Points that leave it are not active.
     """
     positions = batch.positions.clone()
