@@ -21,8 +21,8 @@ BOUNDS: dict[str, tuple[Config, int, int, int]] = {
     "paper": (small("paper", num_history=0), 608, 32, 736),
     "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3510, 129, 3539),
     "keypoints": (small("keypoints"), 868, 35, 898),
-    "default": (small("default"), 4848, 127, 5008),
-    "offline": (small("offline"), 5271, 140, 5415),
+    "default": (small("default"), 4836, 127, 4996),
+    "offline": (small("offline"), 5259, 140, 5403),
 }
 
 

@@ -6,7 +6,7 @@ with t+1 as if it were one object. If a sweep then matches clearly better, we co
     align               up to three times, while a sweep matches better
         corrections
             register        some structure of all sweeps. If a sweep matches better, we register more structure
-            are_clear       the blocks of 5 m vote
+            Votes           blocks of 5 m vote
         corrected           moves the points, the origins of the sweeps and the pose flow
         draw                the moved points
 
@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import floor_divide
+from cflow_torch.ops.indices import floor_divide, take_columns
 from cflow_torch.verified.columns import count_slices
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.refinement import Registration
@@ -64,12 +64,14 @@ def corrections(sweeps: HeightSlicedSweeps) -> RigidMotion | None:
 
     The B S motions are those of the images of the batch (`Batch.image`). None = no sweep matches clearly better.
     """
-    _, gains = _register(sweeps, _FEW, _FEW_ITERATIONS)
-    is_likely = gains.are_likely().view(sweeps.batch.num_windows, -1).any(1)  # of each window
+    first = Gains.of(*_register(sweeps, _FEW, _FEW_ITERATIONS))
+    is_likely = first.are_large().view(sweeps.batch.num_windows, -1).any(1)  # of each window
     if not bool(is_likely.any()):
         return None
-    motion, gains = _register(sweeps, _MORE, _MORE_ITERATIONS)
-    motion = motion.only(is_likely.repeat_interleave(sweeps.num_steps) & gains.are_clear())
+    registration, motion = _register(sweeps, _MORE, _MORE_ITERATIONS)
+    gains = Gains.of(registration, motion)
+    is_clear = gains.are_large() & Votes.of(sweeps, registration, gains.of_voxel).agree()
+    motion = motion.only(is_likely.repeat_interleave(sweeps.num_steps) & is_clear)
     return _alike_at_t(motion, sweeps.batch) if bool(motion.flow.any()) else None
 
 
@@ -83,25 +85,51 @@ def _alike_at_t(motion: RigidMotion, batch: Batch) -> RigidMotion:
 
 
 class Gains(NamedTuple):
-    """What each of B S sweeps gains by a motion."""
+    """What the voxels of B S sweeps gain by a motion."""
 
-    mean: Tensor  # (B S,) float64, of its voxels, see `Registration.gains`; NaN without any
+    of_voxel: Tensor  # (K,) float64, see `Registration.gains`
+    mean: Tensor  # (B S,) float64, of the voxels of each sweep; NaN without any
     z: Tensor  # (B S,) float64, their sum over the root of the sum of their squares
-    num_better: Tensor  # (B S,) int64, blocks of 5 m whose voxels together gain more than the noise of their sum
-    num_worse: Tensor  # (B S,) int64, blocks that lose more than it
 
-    def are_likely(self) -> Tensor:
-        """Tell which gains are large enough, (B S,) bool."""
+    @classmethod
+    def of(cls, registration: Registration, motion: RigidMotion) -> Gains:
+        """Compare a motion with none."""
+        by_image = registration.source.by_object
+        gain = registration.gains(motion, registration.source)
+        total, square = by_image.sum(torch.stack((gain, gain.square())))
+        return cls(gain, total / by_image.size(), total / square.sqrt())
+
+    def are_large(self) -> Tensor:
+        """Tell which sweeps gain enough, (B S,) bool."""
         return (self.mean >= _LEAST_GAIN) & (self.z >= _GAIN_Z)
 
-    def are_clear(self) -> Tensor:
-        """Tell which gains are large enough, and those of most blocks, (B S,) bool."""
-        noise = (self.num_better + self.num_worse).double().sqrt()
-        is_majority = self.num_better - self.num_worse > _VOTE_Z * noise
-        return self.are_likely() & is_majority & (self.num_better >= _FEWEST_BETTER)
+
+class Votes(NamedTuple):
+    """The blocks of 5 m of B S sweeps whose gain or loss exceeds its noise."""
+
+    better: Tensor  # (B S,) int64, number of blocks that gain
+    worse: Tensor  # (B S,) int64, number of blocks that lose
+
+    @classmethod
+    def of(cls, sweeps: HeightSlicedSweeps, registration: Registration, gain: Tensor) -> Votes:
+        """Add up the gains of the K voxels of the source, (K,) float64, in the blocks of their sweeps."""
+        source = registration.source
+        side = sweeps.grid.whole_pixels(_VOTING)
+        lattice = sweeps.grid.lattice(side)
+        row, col = floor_divide(take_columns(registration.voxels.place[2:], source.voxel), side)
+        count = source.by_object.count
+        blocks = Groups(lattice.cell(source.by_object.of_item, row, col), count * lattice.area)
+        total, square = blocks.sum(torch.stack((gain, gain.square()))).view(2, count, -1)
+        noise = square.sqrt()
+        return cls((total > noise).sum(1), (total < -noise).sum(1))
+
+    def agree(self) -> Tensor:
+        """Tell in which sweeps enough blocks gain, and most, (B S,) bool."""
+        noise = (self.better + self.worse).double().sqrt()
+        return (self.better - self.worse > _VOTE_Z * noise) & (self.better >= _FEWEST_BETTER)
 
 
-def _register(sweeps: HeightSlicedSweeps, most: int, num_iterations: int) -> tuple[RigidMotion, Gains]:
+def _register(sweeps: HeightSlicedSweeps, most: int, num_iterations: int) -> tuple[Registration, RigidMotion]:
     """Register every sweep with t+1, by about `most` pixels of structure. Sweeps t+1 stay."""
     voxels = Voxels.of(_structure(sweeps, most), sweeps)
     count = sweeps.batch.num_windows * sweeps.num_steps
@@ -110,24 +138,7 @@ def _register(sweeps: HeightSlicedSweeps, most: int, num_iterations: int) -> tup
     origin = sweeps.elapsed.new_zeros((2, count))  # sweeps rotate about it
     # Each sweep has its own motion, so its age does not matter.
     registration = Registration(voxels, by_image, origin, torch.ones_like(sweeps.elapsed))
-    motion = registration.align(origin.t(), num_iterations)
-
-    source = registration.source
-    gain = registration.gains(motion, source)
-    side = sweeps.grid.whole_pixels(_VOTING)
-    lattice = sweeps.grid.lattice(side)
-    row, col = floor_divide(voxels.place[2:].index_select(1, source.voxel), side)
-    blocks = Groups(lattice.cell(source.by_object.of_item, row, col), count * lattice.area)
-    both = torch.stack((gain, gain.square()))
-    of_block, of_noise = blocks.sum(both).view(2, count, -1)
-    of_noise = of_noise.sqrt()
-    total, square = source.by_object.sum(both)
-    return motion, Gains(
-        mean=total / source.by_object.size(),
-        z=total / square.sqrt(),
-        num_better=(of_block > of_noise).sum(1),
-        num_worse=(of_block < -of_noise).sum(1),
-    )
+    return registration, registration.align(origin.t(), num_iterations)
 
 
 def _structure(sweeps: HeightSlicedSweeps, most: int) -> ObjectPoints:

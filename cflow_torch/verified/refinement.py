@@ -232,7 +232,7 @@ class Registration:
     """
 
     def __init__(self, voxels: Voxels, by_object: Groups, centre: Tensor, elapsed: Tensor) -> None:
-        self._voxels = voxels
+        self.voxels = voxels
         self._target = VoxelSearch(voxels, flat_nonzero(voxels.step == 0))
         self._covariance = covariance_of(voxels)  # [6, V]
         self._centre = centre
@@ -295,9 +295,9 @@ class Registration:
 
         # 0 = none: this voxel is far away, and belongs to no object.
         target = self._target.nearest(source.target_start, source.target_layers, moved)  # [K]
-        residual = take_columns(self._voxels.position, target) - moved
+        residual = take_columns(self.voxels.position, target) - moved
         is_near = residual.square().sum(0) <= _FARTHEST**2
-        object_id = self._voxels.object_id
+        object_id = self.voxels.object_id
         is_same = object_id.index_select(0, target) == object_id.index_select(0, source.voxel)
         covariance = source.covariance + take_columns(self._covariance, target)
         information = full(inverse(covariance))
@@ -355,7 +355,7 @@ class Registration:
             the points in its voxels of that sweep and of t+1, all in sweep intervals. The motion divided by the ratio
             explains the correspondences best. Objects without any, or with a ratio below 0.75, get 1.
         """
-        time = self._voxels.time
+        time = self.voxels.time
         assert time is not None
 
         def times(source: Source) -> Tensor:

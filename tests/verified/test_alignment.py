@@ -86,8 +86,10 @@ def test_a_car_alone_is_not_the_world():
     """It moves by less than the alignment reaches, and nothing else is seen."""
     car = np.random.default_rng(0).random((4000, 3)) * (4.0, 1.8, 1.5) + (5, 0, 0)
     window = Window(Sweep(car.astype(np.float32)), Sweep((car + (0.15, 0, 0)).astype(np.float32)))
-    _, gains = alignment._register(sweeps_of([window], MODEL), 3000, 6)
-    assert gains.mean[1] > 0.05 and not gains.are_clear().any()
+    sweeps = sweeps_of([window], MODEL)
+    registration, motion = alignment._register(sweeps, 3000, 6)
+    gains = alignment.Gains.of(registration, motion)
+    assert gains.are_large()[1] and not alignment.Votes.of(sweeps, registration, gains.of_voxel).agree().any()
     (result,) = VerifiedFlow(MODEL)([window])
     assert torch.allclose(result.residual_flow, torch.tensor([0.15, 0.0, 0.0]), atol=0.02)
 
@@ -113,11 +115,15 @@ def test_a_correction_acts_as_other_poses():
 
 
 def test_blocks_vote():
-    """12 of 14 blocks suffice. Nine alone do not, nor does a small majority, a small gain or one within the noise."""
-    mean = torch.tensor([0.02, 0.02, 0.02, 0.005, 0.02, float("nan")], dtype=torch.float64)
-    z = torch.tensor([9.0, 9.0, 9.0, 9.0, 2.0, float("nan")], dtype=torch.float64)
-    better, worse = torch.tensor([12, 9, 12, 12, 12, 0]), torch.tensor([2, 0, 4, 2, 2, 0])
-    assert alignment.Gains(mean, z, better, worse).are_clear().tolist() == [True, False, False, False, False, False]
+    """12 of 14 blocks suffice. Nine alone do not, nor does a small majority."""
+    votes = alignment.Votes(torch.tensor([12, 9, 12, 0]), torch.tensor([2, 0, 4, 0]))
+    assert votes.agree().tolist() == [True, False, False, False]
+
+
+def test_small_gains_and_those_within_the_noise_change_nothing():
+    mean = torch.tensor([0.02, 0.005, 0.02, float("nan")], dtype=torch.float64)
+    z = torch.tensor([9.0, 9.0, 2.0, float("nan")], dtype=torch.float64)
+    assert alignment.Gains(mean, mean, z).are_large().tolist() == [True, False, False, False]
 
 
 def test_a_correction_is_told_once():
